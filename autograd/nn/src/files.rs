@@ -1,13 +1,13 @@
-//! Files that are whole or untouched.
+//! Atomic file writes.
 
 use std::collections::HashSet;
 use std::io::{Result, Write};
 use std::path::Path;
 
-/// Writes `bytes` to the file `path`, which afterwards holds all of them or is untouched.
+/// Writes `bytes` to the file `path` atomically: the file then has all of them, or is unchanged.
 ///
-/// The bytes go to a temporary file in the same folder, reach the disk, and only then take the name `path`: an
-/// interruption or a full disk never leaves a partial file, nor harms one that was there before.
+/// The bytes go to a temporary file in the same folder and are flushed to the disk. Then the file is renamed to `path`.
+/// An interruption or a full disk leaves no partial file, and does not damage an existing one.
 ///
 /// # Errors
 /// If the folder does not exist or the file cannot be written.
@@ -27,14 +27,14 @@ pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     Ok(())
 }
 
-/// Whether names can be those of the entries of a safetensors file; the first that cannot.
+/// The first name that cannot be an entry of a safetensors file, if any.
 pub(crate) fn bad_entry<'a>(names: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let mut seen = HashSet::new();
     // What the format calls its metadata.
     names.into_iter().find(|name| *name == "__metadata__" || !seen.insert(*name))
 }
 
-/// A name from a file as a message repeats it: on one line, and not all of a long one.
+/// A name from a file for a message: on one line, and cut if it is long.
 pub(crate) fn shown(name: &str) -> String {
     name.chars().take(200).flat_map(char::escape_debug).collect()
 }

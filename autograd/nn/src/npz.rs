@@ -1,7 +1,7 @@
 //! Parameters as NumPy's `.npz`: a zip archive with a `.npy` file for each array.
 //!
-//! The crate `ndarray-npy` (0.10) is not used: it allocates what a header announces before it looks how much there is, so
-//! a file of a hundred bytes that claims 2^60 elements ends the process.
+//! This module does not use the crate `ndarray-npy` (0.10). That crate allocates the size in a header before it checks
+//! the size of the file. A file of a hundred bytes that claims 2^60 elements would end the process.
 
 use crate::files::shown;
 use crate::{Params, write_atomic};
@@ -11,7 +11,7 @@ use std::collections::{BTreeMap, HashSet};
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
-/// Why parameters could not be written to or read from a `.npz` file.
+/// The reason that a `.npz` file cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum NpzError {
     /// The file cannot be read or written.
@@ -19,7 +19,7 @@ pub enum NpzError {
     File {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The I/O error.
         error: std::io::Error,
     },
     /// The file is not a zip archive or is damaged.
@@ -27,7 +27,7 @@ pub enum NpzError {
     Archive {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The damage.
         what: String,
     },
     /// An array of the file is damaged or does not fit the parameter of its name.
@@ -35,24 +35,25 @@ pub enum NpzError {
     Array {
         /// The file.
         path: PathBuf,
-        /// The array.
+        /// The name of the array.
         name: String,
-        /// What is wrong.
+        /// The mismatch or damage.
         what: String,
     },
 }
 
-/// What the arrays of a file may take: so many bytes for each of the file, and so many whatever its length. Numbers hardly get
-/// shorter by compression, but zeros do, to a thousandth: of an archive that says so, a megabyte would fill a gigabyte.
+/// Limit of the bytes of all arrays: the first number times the bytes of the file, plus the second. Compression hardly
+/// shortens numbers, but it shortens zeros to a thousandth: an archive of a megabyte can expand to a gigabyte.
 const MOST: [u64; 2] = [64, 1 << 28];
 
-/// What is wrong with an array, for [`NpzError::Array`].
+/// The damage of an array, for [`NpzError::Array`].
 type What = String;
 
 impl<T: Scalar> Params<T> {
-    /// Writes the parameters to a `.npz` file, uncompressed as `numpy.savez` does it: `numpy.load(path)[name]` is the
-    /// parameter `name`. The bytes go to a temporary file beside it, which then takes its name: the file is whole or
-    /// untouched.
+    /// Writes the parameters to a `.npz` file, uncompressed like `numpy.savez`. `numpy.load(path)[name]` is then the
+    /// parameter `name`.
+    ///
+    /// It writes to a temporary file beside `path` and renames it. So the file is complete, or unchanged.
     ///
     /// ```
     /// use raygrad_autograd::Tensor;
@@ -67,7 +68,7 @@ impl<T: Scalar> Params<T> {
     /// ```
     ///
     /// # Errors
-    /// If the file cannot be written, or a name cannot be that of a file in an archive.
+    /// If the file cannot be written, or if a name cannot be a file name in an archive.
     pub fn save_npz(&self, path: impl AsRef<Path>) -> Result<(), NpzError> {
         let path = path.as_ref();
         let mut bytes = vec![];
@@ -79,11 +80,11 @@ impl<T: Scalar> Params<T> {
         write_atomic(path, &bytes).map_err(|error| NpzError::File { path: path.into(), error })
     }
 
-    /// Replaces every value by the array of the same name in a `.npz` file, compressed or not, in either order of
-    /// elements. Nothing changes if an array does not fit.
+    /// Replaces every value with the array of the same name in a `.npz` file. The file may be compressed, and arrays
+    /// may have either element order. If an array does not fit, no value changes.
     ///
     /// # Errors
-    /// As [`read_npz`](Self::read_npz), or if names or shapes differ from those of this store.
+    /// Where [`read_npz`](Self::read_npz) fails, or if names or shapes differ from those of this store.
     pub fn load_npz(&mut self, path: impl AsRef<Path>) -> Result<(), NpzError> {
         let path = path.as_ref();
         let mut arrays: BTreeMap<String, Tensor<T>> = read(path)?.into_iter().collect();
@@ -105,11 +106,11 @@ impl<T: Scalar> Params<T> {
         Ok(())
     }
 
-    /// A new store with the arrays of a `.npz` file, in the order of the file.
+    /// Reads a `.npz` file into a new store, in the order of the file.
     ///
     /// # Errors
-    /// If the file cannot be read or is damaged, an array has another number type, or the arrays take more than 256 MiB and 64 times
-    /// the bytes of the file; the error names the file and the array.
+    /// If the file cannot be read or is damaged, or an array has another number type. If the arrays take more than 256
+    /// MiB plus 64 times the bytes of the file. The error names the file and the array.
     pub fn read_npz(path: impl AsRef<Path>) -> Result<Self, NpzError> {
         let mut params = Params::new();
         for (name, value) in read(path.as_ref())? {
@@ -127,7 +128,7 @@ fn damaged(path: &Path, error: rawzip::Error) -> NpzError {
     NpzError::Archive { path: path.into(), what: error.to_string() }
 }
 
-/// NumPy's name of the number type, little-endian.
+/// NumPy's name of the number type, in little-endian order.
 fn descr<T: Scalar>() -> &'static str {
     if size_of::<T>() == 4 { "<f4" } else { "<f8" }
 }
@@ -152,7 +153,7 @@ fn store(archive: &mut ZipArchiveWriter<&mut Vec<u8>>, file: &str, bytes: &[u8])
     Ok(())
 }
 
-/// The start of a `.npy` file of version 1, or of version 2 for very many axes.
+/// The start of a `.npy` file of version 1, or version 2 for very many axes.
 fn header<T: Scalar>(shape: &[usize]) -> Vec<u8> {
     // A tuple of one element has a comma, and a list of several may end in one.
     let extents: String = shape.iter().map(|extent| format!("{extent}, ")).collect();
@@ -261,13 +262,13 @@ fn parse<T: Scalar>(bytes: &[u8]) -> Result<Tensor<T>, What> {
     Ok(if fortran { from_columns(&shape, &values) } else { Tensor::from_vec(&shape, values) })
 }
 
-/// What follows a key of the header.
+/// The text after a key of the header.
 fn field<'a>(text: &'a str, key: &str) -> Option<&'a str> {
     let (_, rest) = text.split_once(&format!("'{key}'")).or_else(|| text.split_once(&format!("\"{key}\"")))?;
     Some(rest.trim_start().strip_prefix(':')?.trim_start())
 }
 
-/// A tensor from its elements with the first index running fastest.
+/// A tensor from elements in column-major order (the first index varies fastest).
 fn from_columns<T: Scalar>(shape: &[usize], values: &[T]) -> Tensor<T> {
     Tensor::from_fn(shape, |mut i| {
         let (mut place, mut stride) = (0, values.len());

@@ -11,19 +11,19 @@ mod bound;
 
 pub use bound::{Bound, ParamLayout};
 
-/// A handle on a parameter of one [`Params`] and of the copies that are made of it; any other store refuses it.
+/// A handle of a parameter of one [`Params`] and its copies. Other stores reject it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ParamId {
     place: usize,
-    /// No other parameter of this program has it.
+    /// Unique among all parameters of this program.
     key: u64,
 }
 
-/// A named store of parameters, in the order in which they were added.
+/// The named parameters of a model, in the order in which they were added.
 ///
 /// Layers hold [`ParamId`]s and are pure functions of the bound parameters and their input. A parameter can be frozen,
-/// and can have factors of the learning rate and of the weight decay of its own; parameters are chosen by their names.
-/// The handles of a store fit its clones and casts too, as far as the parameters are the same.
+/// and can have its own factors of the learning rate and of the weight decay. Methods select parameters by name.
+/// Handles of a store are valid for its clones and casts too, for the parameters that they share.
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor};
@@ -37,18 +37,18 @@ pub struct ParamId {
 /// ```
 #[derive(Debug, Clone, Default)]
 pub struct Params<T: Scalar> {
-    /// Shared with what is bound and with copies.
+    /// Shared with bound parameters and copies.
     names: Arc<Names>,
     values: Vec<Tensor<T>>,
     settings: Vec<Setting>,
 }
 
-/// What the parameters of a store are called.
+/// The names of the parameters of a store.
 #[derive(Debug, Clone, Default)]
 struct Names {
     names: Vec<String>,
     places: HashMap<String, usize>,
-    /// For each parameter the number that its handles have.
+    /// For each parameter, the key of its handles.
     keys: Vec<u64>,
 }
 
@@ -65,7 +65,7 @@ impl Names {
         ParamId { place, key }
     }
 
-    /// Where the parameter of a handle stands.
+    /// The position of a handle's parameter.
     #[track_caller]
     fn place(&self, ParamId { place, key }: ParamId) -> usize {
         if self.keys.get(place) != Some(&key) {
@@ -78,7 +78,7 @@ impl Names {
     }
 }
 
-/// How an optimiser treats a parameter.
+/// The settings of a parameter for optimizers.
 #[derive(Debug, Clone, Copy)]
 struct Setting {
     frozen: bool,
@@ -88,7 +88,7 @@ struct Setting {
 }
 
 impl Setting {
-    /// An empty parameter has no rows to move.
+    /// Whether an optimizer updates single rows. An empty parameter has none.
     fn moves_rows<T: Scalar>(&self, value: &Tensor<T>) -> bool {
         self.lazy && !value.is_empty()
     }
@@ -100,10 +100,10 @@ impl<T: Scalar> Params<T> {
         Params { names: Arc::default(), values: vec![], settings: vec![] }
     }
 
-    /// Adds a parameter.
+    /// Adds a parameter and returns its handle.
     ///
     /// # Panics
-    /// If the name is taken.
+    /// If there is already a parameter of this name.
     #[track_caller]
     pub fn add(&mut self, name: impl Into<String>, value: Tensor<T>) -> ParamId {
         let id = Arc::make_mut(&mut self.names).add(name.into());
@@ -112,22 +112,22 @@ impl<T: Scalar> Params<T> {
         id
     }
 
-    /// Number of parameters (tensors).
+    /// Number of parameters; each is one tensor.
     pub fn len(&self) -> usize {
         self.values.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are no parameters.
     pub fn is_empty(&self) -> bool {
         self.values.is_empty()
     }
 
-    /// Number of elements of all parameters together.
+    /// Total number of elements of all parameters.
     pub fn elements(&self) -> usize {
         self.values.iter().map(Tensor::len).sum()
     }
 
-    /// Number of elements of the parameters that are not frozen.
+    /// Total number of elements of the parameters that are not frozen.
     pub fn trainable_elements(&self) -> usize {
         let free = self.values.iter().zip(&self.settings).filter(|(_, setting)| !setting.frozen);
         free.map(|(value, _)| value.len()).sum()
@@ -141,13 +141,13 @@ impl<T: Scalar> Params<T> {
     /// The name of a parameter.
     ///
     /// # Panics
-    /// If the handle is that of another store.
+    /// If the handle belongs to another store.
     #[track_caller]
     pub fn name(&self, id: ParamId) -> &str {
         &self.names.names[self.names.place(id)]
     }
 
-    /// The handles of the parameters that are not frozen, in order: those that have a gradient.
+    /// The handles of the parameters that are not frozen, in order. These have gradients.
     pub fn trainable(&self) -> impl Iterator<Item = ParamId> + '_ {
         self.ids().zip(&self.settings).filter(|(_, setting)| !setting.frozen).map(|(id, _)| id)
     }
@@ -157,12 +157,12 @@ impl<T: Scalar> Params<T> {
         self.names.keys.iter().enumerate().map(|(place, &key)| ParamId { place, key })
     }
 
-    /// The parameter of this name.
+    /// The handle of the parameter of this name, if there is one.
     pub fn find(&self, name: &str) -> Option<ParamId> {
         self.names.places.get(name).map(|&place| ParamId { place, key: self.names.keys[place] })
     }
 
-    /// Changes the settings of the parameters that `which` chooses, and returns how many these are.
+    /// Changes the settings of the parameters that `which` selects, and returns their number.
     fn set(&mut self, which: impl Fn(&str) -> bool, change: impl Fn(&mut Setting)) -> usize {
         let mut count = 0;
         for (_, setting) in self.names.names.iter().zip(&mut self.settings).filter(|(name, _)| which(name)) {
@@ -172,8 +172,8 @@ impl<T: Scalar> Params<T> {
         count
     }
 
-    /// Freezes the parameters whose name `which` chooses, and returns how many these are. A frozen parameter is a
-    /// constant on a tape, so that nothing is computed for its gradient, and optimisers leave it alone.
+    /// Freezes the parameters whose name `which` selects, and returns their number. A frozen parameter is a constant on
+    /// a tape, so it has no gradient, and optimizers skip it.
     ///
     /// ```
     /// use raygrad_autograd::Tensor;
@@ -189,7 +189,7 @@ impl<T: Scalar> Params<T> {
         self.set(which, |setting| setting.frozen = true)
     }
 
-    /// The opposite of [`freeze`](Self::freeze).
+    /// Unfreezes the parameters whose name `which` selects, and returns their number.
     pub fn unfreeze(&mut self, which: impl Fn(&str) -> bool) -> usize {
         self.set(which, |setting| setting.frozen = false)
     }
@@ -197,14 +197,14 @@ impl<T: Scalar> Params<T> {
     /// Whether a parameter is frozen.
     ///
     /// # Panics
-    /// If the handle is that of another store.
+    /// If the handle belongs to another store.
     #[track_caller]
     pub fn is_frozen(&self, id: ParamId) -> bool {
         self.settings[self.names.place(id)].frozen
     }
 
-    /// Gives the parameters whose name `which` chooses a factor of the learning rate, instead of 1, and returns how many
-    /// these are.
+    /// Sets the lr scale of the parameters whose name `which` selects, and returns their number. The lr scale is a
+    /// factor of the learning rate, 1 by default.
     ///
     /// # Panics
     /// If the factor is negative, infinite or NaN.
@@ -214,8 +214,8 @@ impl<T: Scalar> Params<T> {
         self.set(which, |setting| setting.rate = factor)
     }
 
-    /// Gives the parameters whose name `which` chooses a factor of the weight decay, instead of 1, and returns how many
-    /// these are. Biases and gains usually have 0.
+    /// Sets the factor of the weight decay of the parameters whose name `which` selects, and returns their number. The
+    /// default is 1; biases and gains usually have 0.
     ///
     /// # Panics
     /// If the factor is negative, infinite or NaN.
@@ -225,36 +225,38 @@ impl<T: Scalar> Params<T> {
         self.set(which, |setting| setting.decay = factor)
     }
 
-    /// Chooses whether the parameters whose name `which` chooses are lazy, which they are not at first, and returns how
-    /// many these are.
+    /// Sets whether the parameters whose name `which` selects are lazy, and returns their number. By default no
+    /// parameter is lazy.
     ///
-    /// A lazy parameter is a table of which a step uses few rows, along its first axis: an embedding. Optimisers then
-    /// read and move only the rows whose gradient is not zero, and what they remember of others stands still too. That is
-    /// another optimiser: a row that gets one late gradient moves once, where momentum moves it over the following steps
-    /// too ([`Adam`](crate::Adam)). Choose before the first step.
+    /// A lazy parameter is a table, such as an embedding, of which a step uses few rows along the first axis.
+    /// Optimizers then read and update only the rows whose gradient is not zero. The state of other rows does not
+    /// change either.
+    ///
+    /// Results differ from those of a dense update. A row with one late gradient changes once, where momentum would
+    /// change it over the following steps too ([`Adam`](crate::Adam)). Set this before the first step.
     pub fn set_lazy(&mut self, which: impl Fn(&str) -> bool, lazy: bool) -> usize {
         self.set(which, |setting| setting.lazy = lazy)
     }
 
-    /// Whether only rows of a parameter are moved: see [`set_lazy`](Self::set_lazy).
+    /// Whether a parameter is lazy; see [`set_lazy`](Self::set_lazy).
     ///
     /// # Panics
-    /// If the handle is that of another store.
+    /// If the handle belongs to another store.
     #[track_caller]
     pub fn is_lazy(&self, id: ParamId) -> bool {
         self.settings[self.names.place(id)].lazy
     }
 
-    /// Whether optimisers move only rows of a parameter: it is lazy, and not empty.
+    /// Whether optimizers update single rows of a parameter: it is lazy, and not empty.
     pub(crate) fn moves_rows(&self, id: ParamId) -> bool {
         let place = self.names.place(id);
         self.settings[place].moves_rows(&self.values[place])
     }
 
-    /// The factor of a parameter's learning rate.
+    /// The lr scale of a parameter: the factor of its learning rate.
     ///
     /// # Panics
-    /// If the handle is that of another store.
+    /// If the handle belongs to another store.
     #[track_caller]
     pub fn lr_scale(&self, id: ParamId) -> f64 {
         self.settings[self.names.place(id)].rate
@@ -263,18 +265,19 @@ impl<T: Scalar> Params<T> {
     /// The factor of a parameter's weight decay.
     ///
     /// # Panics
-    /// If the handle is that of another store.
+    /// If the handle belongs to another store.
     #[track_caller]
     pub fn weight_decay_scale(&self, id: ParamId) -> f64 {
         self.settings[self.names.place(id)].decay
     }
 
-    /// What an optimiser is to do with these gradients: one [`ParamUpdate`] for each parameter that is not frozen and whose
-    /// gradient has a share. `rate` gives the learning rate of the parameter at a place of the store, before its factor.
+    /// The updates for these gradients: one [`ParamUpdate`] for each parameter that is not frozen and whose gradient is
+    /// not [zero](Gradient::is_zero). For implementations of [`Optimizer`](crate::Optimizer). `rate` maps the position
+    /// of a parameter in the store to its learning rate, before its lr scale.
     ///
     /// # Panics
-    /// If there is not one gradient of the same shape for each parameter that is not frozen, or a rate is not within 0
-    /// to 1e30.
+    /// If there is not one gradient of the same shape for each parameter that is not frozen. If a rate is not in 0 to
+    /// 1e30.
     #[track_caller]
     pub fn updates<'a>(
         &'a mut self,
@@ -309,30 +312,30 @@ impl<T: Scalar> Params<T> {
         &self.values
     }
 
-    /// The values in order, for an optimiser.
+    /// The values in order, for an optimizer to change.
     pub fn values_mut(&mut self) -> &mut [Tensor<T>] {
         &mut self.values
     }
 
-    /// One value.
+    /// The value of a parameter.
     ///
     /// # Panics
-    /// If the handle is that of another store.
+    /// If the handle belongs to another store.
     #[track_caller]
     pub fn get(&self, id: ParamId) -> &Tensor<T> {
         &self.values[self.names.place(id)]
     }
 
-    /// One value, for an optimiser.
+    /// The value of a parameter, for an optimizer to change.
     ///
     /// # Panics
-    /// If the handle is that of another store.
+    /// If the handle belongs to another store.
     #[track_caller]
     pub fn get_mut(&mut self, id: ParamId) -> &mut Tensor<T> {
         &mut self.values[self.names.place(id)]
     }
 
-    /// The parameters as leaves of a tape; frozen ones as constants, which have no gradient.
+    /// Puts the parameters on a tape as leaves. Frozen ones become constants, which have no gradient.
     #[track_caller]
     pub fn bind<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
         let mut vars = Vec::with_capacity(self.len());
@@ -342,19 +345,19 @@ impl<T: Scalar> Params<T> {
         Bound { names: self.names.clone(), vars, tape: Some(tape) }
     }
 
-    /// The parameters as constants of a tape, for evaluation.
+    /// Puts the parameters on a tape as constants, for evaluation.
     pub fn bind_constant<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
         let vars = self.values.iter().map(|value| tape.constant(value.clone())).collect();
         Bound { names: self.names.clone(), vars, tape: Some(tape) }
     }
 
-    /// What the handles of this store fit, without its values.
+    /// The names and handles of this store, without its values.
     pub fn layout(&self) -> ParamLayout {
         ParamLayout(self.names.clone())
     }
 
-    /// Takes values and settings from a store of the same names and shapes, which may have another precision: the
-    /// handles of a model that was made anew then fit the parameters of an old one.
+    /// Copies values and settings from a store of the same names and shapes, which may have another precision. So the
+    /// handles of a new model become valid for the parameters of an old one.
     ///
     /// ```
     /// use raygrad_autograd::Tensor;
@@ -375,8 +378,8 @@ impl<T: Scalar> Params<T> {
         self.settings.clone_from(&other.settings);
     }
 
-    /// Takes over what was said of the parameters of another store with the same names: which are frozen, with their values,
-    /// and what rates, decay and laziness they have. All others keep their values.
+    /// Copies the settings from a store with the same names: frozen parameters, lr scales, factors of the weight decay,
+    /// laziness. It copies the values of frozen parameters too; all others keep their values.
     ///
     /// # Panics
     /// If names or shapes differ.
@@ -391,7 +394,7 @@ impl<T: Scalar> Params<T> {
         self.settings.clone_from(&other.settings);
     }
 
-    /// That another store has parameters of the same names and shapes.
+    /// Checks that another store has parameters of the same names and shapes.
     #[track_caller]
     pub(crate) fn check_fits<U: Scalar>(&self, other: &Params<U>) {
         assert!(
@@ -412,7 +415,7 @@ impl<T: Scalar> Params<T> {
         }
     }
 
-    /// Other values of the same shapes.
+    /// Replaces the values with others of the same shapes.
     pub(crate) fn replace(&mut self, values: Vec<Tensor<T>>) {
         self.values = values;
     }

@@ -9,22 +9,22 @@ use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 
-/// The number type in which a file holds parameters. They are rounded once, when they are written; arithmetic stays in
-/// their own type. A parameter with a number too large for the type is stored in full.
+/// The number type of parameters in a file. Values are rounded once, on writing; arithmetic uses the model's own type.
+/// A parameter with a number out of the type's range is stored in full precision.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Storage {
-    /// That of the model: parameters come back bit for bit.
+    /// The model's own type: parameters are restored bit for bit.
     #[default]
     Full,
     /// IEEE 754 binary16: a relative error of at most 4.9e-4 from 6.1e-5 to 65504, and steps of 6e-8 below.
     F16,
-    /// The upper half of an f32: a relative error of at most 3.9e-3, and the range of f32.
+    /// bfloat16, the upper half of an f32: a relative error of at most 3.9e-3, and the range of f32.
     Bf16,
 }
 
 impl Storage {
-    /// The nearest number of the type.
+    /// Rounds to the nearest number of the type.
     fn round<T: Scalar>(self, x: T) -> T {
         match self {
             Storage::Full => x,
@@ -33,7 +33,7 @@ impl Storage {
         }
     }
 
-    /// How these values are stored.
+    /// The storage type for these values: this one, or full precision if a value is out of range.
     fn that_fits<T: Scalar>(self, values: &[T]) -> Self {
         let fits = |x: &T| !x.is_finite() || self.round(*x).is_finite();
         if values.iter().all(fits) { self } else { Storage::Full }
@@ -48,7 +48,7 @@ impl Storage {
         }
     }
 
-    /// What holds a tensor of this type.
+    /// The storage type of a safetensors number type, if any.
     fn of<T: Scalar>(dtype: Dtype) -> Option<Self> {
         [Storage::Full, Storage::F16, Storage::Bf16].into_iter().find(|storage| storage.dtype::<T>() == dtype)
     }
@@ -75,13 +75,13 @@ impl Storage {
     }
 }
 
-/// Why stored parameters do not fit a model.
+/// The reason that stored parameters do not fit a model.
 #[derive(Debug, thiserror::Error)]
 pub enum ParamsError {
     /// The bytes are not a safetensors file.
     #[error("not a safetensors file: {}", shown(&.0.to_string()))]
     Format(#[from] safetensors::SafeTensorError),
-    /// Two entries of a file would have one name, or that of the format's own.
+    /// Two entries of a file would have one name, or an entry would have the format's reserved name.
     #[error("`{}` cannot be the name of an entry: another one has it, or the format itself", shown(.0))]
     Name(String),
     /// A parameter of the model is not in the file.
@@ -93,7 +93,7 @@ pub enum ParamsError {
     /// A parameter has another shape or number type in the file.
     #[error("`{name}` is {found} in the file and {expected} in this model")]
     Mismatch {
-        /// The parameter.
+        /// The name of the parameter.
         name: String,
         /// Type and shape in the file.
         found: String,
@@ -102,11 +102,11 @@ pub enum ParamsError {
     },
 }
 
-/// A part of a file, which is written out only when its turn comes: so no second copy of all numbers is made.
+/// An entry of a file, which is serialised only on writing. So there is no second copy of all numbers.
 pub(crate) enum Part<'a, T: Scalar> {
-    /// A tensor, as it is stored.
+    /// A tensor with its storage type.
     Value(Storage, &'a Tensor<T>),
-    /// Numbers of another type as bytes, and how many they are.
+    /// Numbers of another type as bytes, with their number.
     Bytes(Dtype, [usize; 1], Cow<'a, [u8]>),
 }
 
@@ -138,7 +138,7 @@ impl<T: Scalar> View for Part<'_, T> {
 }
 
 impl<T: Scalar> Params<T> {
-    /// Rounds every value to what is stored.
+    /// Rounds every value to the storage type.
     pub fn round_to(&mut self, storage: Storage) {
         for value in self.values_mut() {
             let storage = storage.that_fits(value.as_slice());
@@ -146,10 +146,11 @@ impl<T: Scalar> Params<T> {
         }
     }
 
-    /// The parameters as a safetensors file, with `metadata` and further named bytes. Equal contents give equal bytes.
+    /// Serialises the parameters as a safetensors file, with `metadata` and further named byte arrays. Equal contents
+    /// give equal bytes.
     ///
     /// # Errors
-    /// If the format cannot hold them, as two of one name, or one called `__metadata__`.
+    /// If the format cannot hold them: two entries of one name, or an entry named `__metadata__`.
     pub fn to_safetensors(
         &self,
         storage: Storage,
@@ -167,12 +168,12 @@ impl<T: Scalar> Params<T> {
         Ok(bytes)
     }
 
-    /// Replaces every value by that of the same name in a safetensors file, and returns the further bytes that the file
-    /// holds by their names. Nothing changes if a value does not fit.
+    /// Replaces every value with that of the same name in a safetensors file. Returns the further byte arrays of the
+    /// file by name. If a value does not fit, no value changes.
     ///
     /// # Errors
-    /// If the bytes are no safetensors file, names or shapes differ from those of this store, or a number type is neither
-    /// that of this store nor one of 16 bits.
+    /// If the bytes are not a safetensors file, or names or shapes differ from those of this store. Also if a number
+    /// type is neither that of this store nor a 16-bit type.
     pub fn load_safetensors(&mut self, bytes: &[u8]) -> Result<HashMap<String, Vec<u8>>, ParamsError> {
         let file = SafeTensors::deserialize(bytes)?;
         let mut values = Vec::with_capacity(self.len());
@@ -201,11 +202,11 @@ impl<T: Scalar> Params<T> {
     }
 }
 
-/// How a safetensors file with metadata begins, after the length of its header.
+/// The start of a safetensors file with metadata, after the length of its header.
 const METADATA: &[u8] = b"{\"__metadata__\":";
 
-/// Puts the metadata of a safetensors file in order. The crate writes them in that of a hash map, which is another one in
-/// every run; in whatever order, they take the same bytes.
+/// Sorts the metadata of a safetensors file by key. The crate writes them in the order of a hash map, which differs in
+/// every run. Their length does not depend on the order.
 fn sort_metadata(bytes: &mut [u8], metadata: &BTreeMap<String, String>) -> Result<(), ParamsError> {
     let sorted = serde_json::to_vec(metadata).map_err(safetensors::SafeTensorError::from)?;
     let header = bytes[size_of::<u64>()..].split_at_mut_checked(METADATA.len());
@@ -214,21 +215,21 @@ fn sort_metadata(bytes: &mut [u8], metadata: &BTreeMap<String, String>) -> Resul
     Ok(())
 }
 
-/// The bytes of this name that stand beside the parameters in a safetensors file, for what has to be known before there
-/// are parameters to read.
+/// Reads the byte array of this name from a safetensors file, before its parameters are read. `None` if the file does
+/// not have it.
 ///
 /// # Errors
-/// If it is no such file.
+/// If the bytes are not a safetensors file.
 pub fn stored_bytes(bytes: &[u8], name: &str) -> Result<Option<Vec<u8>>, ParamsError> {
     let file = SafeTensors::deserialize(bytes)?;
     let found = file.tensor(name).ok().filter(|view| view.dtype() == Dtype::U8);
     Ok(found.map(|view| view.data().to_vec()))
 }
 
-/// The words under this key of what a safetensors file says of itself.
+/// Reads the metadata value of this key from a safetensors file. `None` if the file does not have it.
 ///
 /// # Errors
-/// If it is no such file.
+/// If the bytes are not a safetensors file.
 pub fn stored_words(bytes: &[u8], key: &str) -> Result<Option<String>, ParamsError> {
     let (_, header) = SafeTensors::read_metadata(bytes)?;
     Ok(header.metadata().as_ref().and_then(|words| words.get(key).cloned()))

@@ -1,4 +1,4 @@
-//! A training step in tiles: on as many cores as there are, with the same bits on any number of them.
+//! A training step in parallel tiles, with the same bits for any number of threads.
 
 use crate::{Bound, Params};
 use raygrad_autograd::{Gradient, SparseGrad, Tape, Var};
@@ -6,17 +6,19 @@ use raygrad_tensor::parallel::locked;
 use raygrad_tensor::{Pool, Scalar, Tensor, add_assign, parallel};
 use std::sync::{Arc, Mutex};
 
-/// Gradients are summed within this many slots and then in slot order: fixed, so that the sums do not depend on the
-/// number of threads, and as many as threads can work at a time. Steps of so many tiles have one for each slot.
+/// Number of slots. Gradients are summed within each slot and then in slot order. The number is fixed, so that sums do
+/// not depend on the number of threads; at most this many threads work at a time. In a step of this many tiles, each
+/// slot has one.
 pub const SLOTS: usize = 8;
 
-/// Works a training step out in tiles: parts of a batch, each small enough for the caches of a core, with a tape of its own
-/// that is built, differentiated and dropped at once. The gradient of the step is the sum of the tiles' gradients.
+/// Differentiates a training step in tiles, in parallel. A tile is a part of a batch that is small enough for the
+/// caches of a core. Each tile has its own tape, which is recorded, differentiated and cleared at once. The gradient of
+/// the step is the sum of the tiles' gradients.
 ///
-/// Tiles are dealt to 8 slots in turn. A slot adds its tiles up one after another, and the sums of the slots are added in
-/// their order: so the same bits come out at any number of threads. Sparse shares are not added but stay in the order of
-/// the tiles. Tapes and what else a tile is worked out with (`S`) are kept from step to step, one for each thread that was
-/// at work at a time, so that after the first steps nothing of tensor size is allocated.
+/// Tiles go to 8 slots in turn. A slot sums its tiles one after another, and the sums of the slots are added in order.
+/// So the bits are the same for any number of threads. Sparse contributions are not summed, but stay in the order of
+/// the tiles. Tapes and scratch data (`S`) are kept from step to step, one for each thread at work. After the first
+/// steps no tensor-sized memory is allocated.
 ///
 /// ```
 /// use raygrad_autograd::Tensor;
@@ -45,28 +47,27 @@ pub const SLOTS: usize = 8;
 /// ```
 pub struct Tiles<T: Scalar, S = ()> {
     slots: Vec<Slot<T>>,
-    /// What no thread is working with.
+    /// Tapes and scratch data that no thread is using.
     free: Mutex<Vec<(Tape<T>, S)>>,
     pool: Pool<T>,
 }
 
-/// What a step gives.
+/// The result of a step.
 pub struct TileSums<T: Scalar, R> {
-    /// The gradient of each parameter that is not frozen, in their order: what an
-    /// [`Optimizer`](crate::Optimizer) takes.
+    /// The gradient of each parameter that is not frozen, in order, for an [`Optimizer`](crate::Optimizer).
     pub grads: Vec<Gradient<T>>,
-    /// What each tile gave beside its loss, in their order.
+    /// The second result of each tile's `loss`, in the order of the tiles.
     pub results: Vec<R>,
 }
 
-/// A sparse share and the number of its tile.
+/// A sparse contribution and the number of its tile.
 type Share<T> = (usize, Arc<dyn SparseGrad<T>>);
 
 /// Sums over the tiles of one slot.
 struct Slot<T: Scalar> {
-    /// For each parameter that is not frozen the dense sum, if it has one in this step, and its buffer.
+    /// For each parameter that is not frozen: whether this step has a dense sum, and its buffer.
     sums: Vec<(bool, Option<Tensor<T>>)>,
-    /// And its sparse shares.
+    /// For each parameter that is not frozen, its sparse contributions.
     shares: Vec<Vec<Share<T>>>,
 }
 
@@ -77,18 +78,20 @@ impl<T: Scalar, S: Default + Send> Default for Tiles<T, S> {
 }
 
 impl<T: Scalar, S: Default + Send> Tiles<T, S> {
-    /// Nothing kept so far.
+    /// An empty set of slots, without kept tapes.
     pub fn new() -> Self {
         let slot = || Slot { sums: vec![], shares: vec![] };
         Tiles { slots: (0..SLOTS).map(|_| slot()).collect(), free: Mutex::default(), pool: Pool::new() }
     }
 
-    /// The gradient of the sum of the losses of `count` tiles. `loss` gives the loss of the tile of that number, a scalar on
-    /// the tape of the parameters that it is given, and whatever else is to be known of it. A tile in which nothing depends
-    /// on a parameter may give a constant.
+    /// Computes the gradient of the sum of the losses of `count` tiles.
+    ///
+    /// `loss` gets the number of the tile, the parameters bound to its tape, and scratch data. It returns the tile's
+    /// loss, a scalar on that tape, and any other result. If no operation of a tile depends on a parameter, its loss
+    /// may be a constant.
     ///
     /// # Panics
-    /// As [`Var::backward`](Var::backward).
+    /// Where [`Var::backward`](Var::backward) panics.
     #[track_caller]
     pub fn differentiate<R: Send>(
         &mut self,
@@ -119,7 +122,7 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
         TileSums { grads: self.sums(params, used), results }
     }
 
-    /// Adds the slots up, in order; parallel over parameters.
+    /// Sums the slots in order, in parallel over parameters.
     fn sums(&mut self, params: &Params<T>, used: usize) -> Vec<Gradient<T>> {
         let shapes: Vec<_> = params.trainable().map(|id| params.get(id).shape()).collect();
         let Some((first, rest)) = self.slots[..used].split_first_mut() else {
@@ -153,7 +156,7 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
         shapes.into_iter().enumerate().map(gradient).collect()
     }
 
-    /// Takes the memory of gradients back that are no longer needed, for the next step.
+    /// Reuses the memory of gradients for the next step.
     pub fn take_back(&mut self, grads: Vec<Gradient<T>>) {
         for ((_, sum), grad) in self.slots[0].sums.iter_mut().zip(grads) {
             if grad.dense().is_some() && grad.is_dense() {
@@ -162,14 +165,14 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
         }
     }
 
-    /// Frees memory that no tile since the last call has needed.
+    /// Frees memory that no tile has needed since the last call.
     pub fn trim(&self) {
         locked(&self.free).iter().for_each(|(tape, _)| tape.pool().trim());
     }
 }
 
 impl<T: Scalar> Slot<T> {
-    /// Forgets the last step.
+    /// Clears the sums of the last step.
     fn begin(&mut self, wanted: usize) {
         if self.sums.len() != wanted {
             self.sums = vec![(false, None); wanted];
@@ -179,7 +182,7 @@ impl<T: Scalar> Slot<T> {
         self.shares.iter_mut().for_each(Vec::clear);
     }
 
-    /// Works a tile out and adds its gradients to the sums.
+    /// Differentiates a tile and adds its gradients to the sums.
     #[track_caller]
     fn add<R>(
         &mut self,

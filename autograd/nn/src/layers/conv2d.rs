@@ -6,7 +6,7 @@ use rand::Rng;
 use raygrad_autograd::{Activation, Conv2dConfig, Var};
 use raygrad_tensor::{Scalar, Tensor};
 
-/// A 2-D convolution of images `[n, channels, height, width]`, with a bias for each output channel and an activation.
+/// A 2-D convolution of images `[n, channels, height, width]`, with an activation and a bias for each output channel.
 #[derive(Debug, Clone, Copy)]
 pub struct Conv2d {
     weight: ParamId,
@@ -16,9 +16,9 @@ pub struct Conv2d {
 }
 
 impl Conv2d {
-    /// A layer `[n, channels, h, w] -> [n, outputs, oh, ow]` with the parameters `<name>.weight`
-    /// `[outputs, channels, kernel height, kernel width]` and `<name>.bias` `[outputs]`; the bias is 0. See
-    /// [`Var::conv2d`] for the extents.
+    /// A layer `[n, channels, h, w] -> [n, outputs, oh, ow]`. Its parameters are `<name>.weight`
+    /// `[outputs, channels, kernel height, kernel width]` and `<name>.bias` `[outputs]`. The bias starts at 0.
+    /// [`Var::conv2d`] has the formulas for `oh` and `ow`.
     pub fn new<T: Scalar>(
         params: &mut Params<T>,
         name: &str,
@@ -33,7 +33,7 @@ impl Conv2d {
         Conv2d { bias: Some(params.add(format!("{name}.bias"), Tensor::zeros(&[outputs]))), ..layer }
     }
 
-    /// As [`new`](Self::new), with a weight only.
+    /// As [`new`](Self::new), without a bias.
     pub fn without_bias<T: Scalar>(
         params: &mut Params<T>,
         name: &str,
@@ -50,7 +50,7 @@ impl Conv2d {
         Conv2d { weight: params.add(format!("{name}.weight"), weight), bias: None, config, activation }
     }
 
-    /// The layer's output.
+    /// Computes the layer's output.
     ///
     /// ```
     /// use raygrad_autograd::{Activation, Conv2dConfig, Tape, Tensor};

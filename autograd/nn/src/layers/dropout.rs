@@ -7,8 +7,8 @@ use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::Var;
 use raygrad_tensor::{Scalar, Tensor};
 
-/// Sets elements to 0 at random in training, and scales the others so that the expectation stays (Srivastava et al.
-/// 2014, section 10, "inverted"). Does nothing otherwise.
+/// Dropout: during training, sets random elements to 0 and scales the others so that the expectation stays. This is
+/// inverted dropout (Srivastava et al. 2014, section 10). In evaluation it is the identity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Dropout {
     rate: f64,
@@ -25,9 +25,9 @@ impl Dropout {
         Dropout { rate }
     }
 
-    /// `x`, in training with each element either 0 or divided by `1 - rate`; which ones follows from the seed and the
-    /// place alone. Two layers of a model need passes of their own ([`Mode::part`]), which [`Sequential`](super::Sequential)
-    /// gives them.
+    /// Applies dropout to `x`. In training, each element becomes 0 or is divided by `1 - rate`. The choice depends on
+    /// the seed and the position alone. Two layers of a model need different seeds ([`Mode::part`]), which
+    /// [`Sequential`](super::Sequential) provides.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

@@ -7,11 +7,11 @@ use raygrad_autograd::Var;
 use raygrad_tensor::Scalar;
 use std::sync::Arc;
 
-/// A table with a row of numbers for each of many things: words, images, places.
+/// An embedding: a table with one learned vector for each of many items, such as words, images or places.
 ///
-/// The gradient of the table consists of the rows that were used ([`RowGrad`](raygrad_autograd::RowGrad)s), from the tape to the
-/// optimiser. With [`Params::set_lazy`] only these rows are read and moved; without, the optimiser treats the table as it
-/// treats any parameter, whose gradient is mostly 0.
+/// The gradient of the table is sparse: it has the rows that were used ([`RowGrad`](raygrad_autograd::RowGrad)). With
+/// [`Params::set_lazy`] the optimizer reads and updates only these rows. Otherwise it treats the table as any other
+/// parameter, with a gradient that is mostly 0.
 ///
 /// ```
 /// use raygrad_autograd::Tape;
@@ -37,7 +37,7 @@ pub struct Embedding {
 }
 
 impl Embedding {
-    /// A table of `rows` rows of `width` numbers, the parameter `<name>.weight`.
+    /// A table of `rows` vectors of length `width`, with the parameter `<name>.weight`.
     pub fn new<T: Scalar>(
         params: &mut Params<T>,
         name: &str,
@@ -48,15 +48,15 @@ impl Embedding {
         Embedding { table: params.add(format!("{name}.weight"), init.weight(rows, width, rng)) }
     }
 
-    /// The table's parameter.
+    /// The handle of the table's parameter.
     pub fn table(&self) -> ParamId {
         self.table
     }
 
-    /// The rows of these numbers: `[index.len(), width]`.
+    /// Looks up the vectors of these rows: `[index.len(), width]`.
     ///
     /// # Panics
-    /// If a number is not below that of the rows.
+    /// If an index is not below the number of rows.
     #[track_caller]
     pub fn forward<'t, T: Scalar>(&self, params: &Bound<'t, T>, index: &Arc<[u32]>) -> Var<'t, T> {
         params[self.table].gather_rows(index)

@@ -1,39 +1,39 @@
-//! How weights start.
+//! Weight initialisation.
 
 use rand::{Rng, RngExt};
 use raygrad_tensor::random::standard_normal;
 use raygrad_tensor::{Scalar, Tensor};
 
-/// How the weights of a layer start.
+/// The initial distribution of a layer's weights.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Init {
-    /// Uniform within `sqrt(6 / (inputs + outputs))` of 0 (Glorot and Bengio 2010, equation 16).
+    /// Uniform in `+-sqrt(6 / (inputs + outputs))` (Glorot and Bengio 2010, equation 16).
     Glorot,
-    /// Normal with variance `2 / (inputs + outputs)` (the same, equation 12).
+    /// Normal with variance `2 / (inputs + outputs)` (Glorot and Bengio 2010, equation 12).
     GlorotNormal,
-    /// Uniform within `sqrt(6 / inputs)` of 0 (He et al. 2015, equation 10): keeps the variance through ReLU layers.
+    /// Uniform in `+-sqrt(6 / inputs)` (He et al. 2015, equation 10). It keeps the variance through ReLU layers.
     He,
-    /// Normal with variance `2 / inputs` (the same, equation 10).
+    /// Normal with variance `2 / inputs` (He et al. 2015, equation 10).
     HeNormal,
-    /// Uniform within this bound of 0.
+    /// Uniform in plus or minus this bound.
     Uniform(f64),
     /// Normal with this standard deviation.
     Normal(f64),
-    /// This factor times a random orthogonal matrix, every one equally likely: rows or columns, whichever are fewer, are
-    /// orthogonal and of this length (Saxe, McClelland and Ganguli 2014).
+    /// This factor times a uniformly random orthogonal matrix. Its rows or columns, whichever are fewer, are orthogonal
+    /// and have this length (Saxe, McClelland and Ganguli 2014).
     Orthogonal(f64),
-    /// 0, for what another layer sets going.
+    /// All weights 0.
     Zeros,
 }
 
 impl Init {
-    /// A weight matrix `[inputs, outputs]`.
+    /// Draws a weight matrix `[inputs, outputs]`.
     pub fn weight<T: Scalar>(self, inputs: usize, outputs: usize, rng: &mut (impl Rng + ?Sized)) -> Tensor<T> {
         self.tensor(&[inputs, outputs], [inputs, outputs], rng)
     }
 
-    /// A weight of any shape for a layer each of whose outputs depends on `inputs` numbers and each of whose inputs
-    /// reaches `outputs` numbers. [`Orthogonal`](Self::Orthogonal) sees a matrix whose rows are the first axis.
+    /// Draws a weight of any shape. Each output of the layer depends on `inputs` numbers, and each input affects
+    /// `outputs` numbers. [`Orthogonal`](Self::Orthogonal) treats the weight as a matrix whose rows are the first axis.
     pub fn tensor<T: Scalar>(
         self,
         shape: &[usize],
@@ -59,7 +59,7 @@ fn uniform<T: Scalar>(bound: f64, shape: &[usize], rng: &mut (impl Rng + ?Sized)
     Tensor::from_fn(shape, |_| T::from_f64(bound * (2.0 * rng.random::<f64>() - 1.0)))
 }
 
-/// The orthogonal factor of a matrix of normal variables, whose triangular factor has a positive diagonal: so every
+/// The orthogonal factor of a matrix of normal random numbers. Its triangular factor has a positive diagonal, so every
 /// orthogonal matrix is equally likely (Mezzadri 2007).
 fn orthogonal<T: Scalar>(gain: f64, shape: &[usize], rng: &mut (impl Rng + ?Sized)) -> Tensor<T> {
     let rows = shape.first().copied().unwrap_or(1);

@@ -5,8 +5,8 @@ use crate::{Bound, ParamId, Params};
 use raygrad_autograd::Var;
 use raygrad_tensor::{Scalar, Tensor};
 
-/// Layer normalisation along the last axis (Ba, Kiros and Hinton 2016): mean 0 and variance 1, then a gain and a bias
-/// for each place that are learned.
+/// Layer normalisation along the last axis (Ba, Kiros and Hinton 2016). It normalises to mean 0 and variance 1, then
+/// applies a learned gain and bias for each entry.
 #[derive(Debug, Clone, Copy)]
 pub struct LayerNorm {
     gain: ParamId,
@@ -15,8 +15,8 @@ pub struct LayerNorm {
 }
 
 impl LayerNorm {
-    /// A layer `[.., width] -> [.., width]` with the parameters `<name>.gain`, all 1, and `<name>.bias`, all 0. 1e-5 is
-    /// added to the variance.
+    /// A layer `[.., width] -> [.., width]`. Its parameters are `<name>.gain`, which starts at 1, and `<name>.bias`,
+    /// which starts at 0. It adds `eps` 1e-5 to the variance.
     pub fn new<T: Scalar>(params: &mut Params<T>, name: &str, width: usize) -> Self {
         LayerNorm {
             gain: params.add(format!("{name}.gain"), Tensor::ones(&[width])),
@@ -25,12 +25,12 @@ impl LayerNorm {
         }
     }
 
-    /// The same with another number added to the variance.
+    /// The same layer with another `eps`, which is added to the variance.
     pub fn with_eps(self, eps: f64) -> Self {
         LayerNorm { eps, ..self }
     }
 
-    /// The layer's output.
+    /// Computes the layer's output.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

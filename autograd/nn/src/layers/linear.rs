@@ -6,7 +6,7 @@ use rand::Rng;
 use raygrad_autograd::{Activation, Var};
 use raygrad_tensor::{Scalar, Tensor};
 
-/// A dense layer: `activation(x weight + bias)`, or without the bias.
+/// A dense layer: `activation(x weight + bias)`, with or without a bias.
 #[derive(Debug, Clone)]
 pub struct Linear {
     weight: ParamId,
@@ -15,7 +15,8 @@ pub struct Linear {
 }
 
 impl Linear {
-    /// A layer `[.., inputs] -> [.., outputs]` whose parameters are `<name>.weight` and `<name>.bias`; the bias is 0.
+    /// A layer `[.., inputs] -> [.., outputs]`. Its parameters are `<name>.weight` `[inputs, outputs]` and
+    /// `<name>.bias` `[outputs]`. The bias starts at 0.
     pub fn new<T: Scalar>(
         params: &mut Params<T>,
         name: &str,
@@ -28,7 +29,7 @@ impl Linear {
         Linear { bias: Some(params.add(format!("{name}.bias"), Tensor::zeros(&sizes[1..]))), ..layer }
     }
 
-    /// As [`new`](Self::new), with a weight only.
+    /// As [`new`](Self::new), without a bias.
     pub fn without_bias<T: Scalar>(
         params: &mut Params<T>,
         name: &str,
@@ -44,7 +45,7 @@ impl Linear {
         }
     }
 
-    /// The layer's output.
+    /// Computes the layer's output.
     ///
     /// # Panics
     /// If the last extent of `x` is not the number of inputs.

@@ -1,4 +1,4 @@
-//! A stack of dense layers.
+//! The multilayer perceptron.
 
 use super::{Init, Layer, Linear, Mode};
 use crate::{Bound, Params};
@@ -6,7 +6,8 @@ use rand::Rng;
 use raygrad_autograd::{Activation, Var};
 use raygrad_tensor::Scalar;
 
-/// A stack of dense ReLU layers of one width; before the layers in `skips`, the stack's input is joined to theirs.
+/// A multilayer perceptron: dense ReLU layers of one width. Layers in `skips` get the input of the stack too,
+/// concatenated to their own input.
 #[derive(Debug, Clone)]
 pub struct Mlp {
     layers: Vec<Linear>,
@@ -14,11 +15,11 @@ pub struct Mlp {
 }
 
 impl Mlp {
-    /// `depth` layers `inputs -> width -> .. -> width` with parameters `<name>.0.weight` and so on. Layer numbers in
-    /// `skips` count from 0; the classic NeRF has depth 8 and skips `[5]`.
+    /// `depth` layers `inputs -> width -> .. -> width`, with parameters `<name>.0.weight` and so on. Layer numbers in
+    /// `skips` count from 0. The classic NeRF has depth 8 and skips `[5]`.
     ///
     /// # Panics
-    /// If a skip names the first layer or one that does not exist.
+    /// If `skips` has the first layer, or a layer that does not exist.
     #[track_caller]
     pub fn new<T: Scalar>(
         params: &mut Params<T>,
@@ -43,7 +44,7 @@ impl Mlp {
         Mlp { layers, skips: skips.into() }
     }
 
-    /// The output of the last layer.
+    /// Computes the output of the last layer.
     ///
     /// # Panics
     /// If the last extent of `x` is not the number of inputs.

@@ -1,4 +1,4 @@
-//! Layers: handles on parameters, and pure functions of (parameters, input).
+//! Layers: handles of parameters, and pure functions of parameters and input.
 
 mod conv2d;
 mod dropout;
@@ -22,11 +22,12 @@ use crate::Bound;
 use raygrad_autograd::Var;
 use raygrad_tensor::Scalar;
 
-/// What a [`Sequential`] is made of: a function of one tensor that may have parameters and may differ in training.
+/// The interface of the layers of a [`Sequential`]: a function of one tensor, which may have parameters and may differ
+/// between training and evaluation.
 ///
-/// A layer's own `forward` says what it takes; this trait is for code that does not know which layer it has.
+/// The `forward` method of each layer documents its shapes. This trait is for generic code.
 pub trait Layer<T: Scalar>: Send + Sync {
-    /// The layer's output for `x`.
+    /// Computes the layer's output for `x`.
     ///
     /// # Panics
     /// If the shape of `x` does not fit.
@@ -34,18 +35,19 @@ pub trait Layer<T: Scalar>: Send + Sync {
     fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Mode) -> Var<'t, T>;
 }
 
-/// Whether a layer runs to be used or to be trained. All that is random follows from it, so the same pass gives the
-/// same bits on any thread, and again in a [`checkpoint`](raygrad_autograd::Tape::checkpoint).
+/// Evaluation or training. All randomness of a layer follows from the mode. So the same mode gives the same bits on any
+/// thread, and again in a [`checkpoint`](raygrad_autograd::Tape::checkpoint).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mode {
-    /// To be used: nothing is random.
+    /// Evaluation, without randomness.
     Evaluate,
-    /// To be trained, with this seed: another one for each step, and for each part of a step that has a tape of its own.
+    /// Training with this seed. Use another seed for each step, and for each part of a step that has a separate tape.
     Train(u64),
 }
 
 impl Mode {
-    /// The pass of part number `which` of a model: with a seed of its own, so that two layers do not draw the same.
+    /// The mode for part number `which` of a model. Its seed differs, so that two layers do not draw the same random
+    /// numbers.
     pub fn part(self, which: u64) -> Mode {
         match self {
             Mode::Evaluate => Mode::Evaluate,

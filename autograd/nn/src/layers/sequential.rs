@@ -1,4 +1,4 @@
-//! Layers one after another.
+//! A sequence of layers.
 
 use super::{Layer, Mode};
 use crate::Bound;
@@ -7,7 +7,7 @@ use raygrad_tensor::Scalar;
 use std::fmt;
 use std::sync::Arc;
 
-/// Layers one after another, and functions between them. A clone shares the layers.
+/// A sequence of layers and functions (`torch.nn.Sequential`). Clones share the layers.
 ///
 /// ```
 /// use raygrad_autograd::{Activation, Tape, Tensor};
@@ -46,18 +46,18 @@ where
 }
 
 impl<T: Scalar> Sequential<T> {
-    /// No layers yet: the identity.
+    /// An empty sequence: the identity.
     pub fn new() -> Self {
         Sequential { layers: vec![] }
     }
 
-    /// With a further layer behind the others.
+    /// Appends a layer.
     pub fn then(mut self, layer: impl Layer<T> + 'static) -> Self {
         self.layers.push(Arc::new(layer));
         self
     }
 
-    /// With a function behind the others.
+    /// Appends a function without parameters.
     pub fn map(self, f: impl for<'t> Fn(&Var<'t, T>) -> Var<'t, T> + Send + Sync + 'static) -> Self {
         self.then(Function(f))
     }
@@ -67,12 +67,12 @@ impl<T: Scalar> Sequential<T> {
         self.layers.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are no layers.
     pub fn is_empty(&self) -> bool {
         self.layers.is_empty()
     }
 
-    /// The output of the last layer; each one has a random stream of its own.
+    /// Computes the output of the last layer. Each layer has a separate random stream.
     ///
     /// # Panics
     /// If a shape does not fit.

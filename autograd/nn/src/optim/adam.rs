@@ -10,37 +10,37 @@ use raygrad_autograd::Gradient;
 use raygrad_tensor::Scalar;
 use serde::{Deserialize, Serialize};
 
-/// Adam (Kingma and Ba 2015, algorithm 1), with constants, learning rate and decoupled weight decay of their own for
-/// [groups](Self::add_group) of parameters. [`AdamW`] makes one with decay.
+/// Adam (Kingma and Ba 2015, algorithm 1), with bias correction. Parameter [groups](Self::add_group) can have their own
+/// constants, learning rate and decoupled weight decay. [`AdamW`] makes an optimizer with decay.
 ///
-/// Bias corrections are computed in f64 from an integer step count, which each parameter has for itself. First moments
-/// below 1e-30 (1e-300 in f64) and second ones below 1e-37 (1e-307) are set to 0, so that long runs without gradient do not fill memory with
-/// denormal numbers, which are slow. Gradients count as at most 1e19 (1e154 in f64), so that their squares are finite. Work
-/// is spread over the current rayon pool; the result does not depend on the number of threads.
+/// Bias corrections are computed in f64 from an integer step count, which each parameter has separately. First moments
+/// below 1e-30 (1e-300 in f64) and second moments below 1e-37 (1e-307) are set to 0. So long runs without gradient do
+/// not fill memory with denormal numbers, which are slow. Gradients count as at most 1e19 (1e154 in f64), so that their
+/// squares are finite. Work runs on the current rayon pool; the result does not depend on the number of threads.
 ///
-/// Of a lazy parameter ([`Params::set_lazy`], PyTorch's `SparseAdam`), rows without gradient are not read: their moments do
-/// not decay, and their bias correction stands still, because each row counts its own steps. A row that gets one late
-/// gradient moves by about one learning rate, where dense Adam, which has corrected its moments away by then, moves it over
-/// the following steps too. Where every row has a gradient in every step, the two agree. A step whose gradient does not
-/// consist of rows alone, because a penalty on the whole table is part of the loss, visits every row whose gradient is not
+/// For a lazy parameter ([`Params::set_lazy`], PyTorch's `SparseAdam`), rows without gradient are not read. Each row
+/// counts its own steps, so without gradient its moments do not decay and its bias correction does not change. A row
+/// with one late gradient changes by about one learning rate. Dense Adam, whose bias correction has ended by then,
+/// changes it over the following steps too. If every row has a gradient in every step, both agree. A penalty on the
+/// whole table makes a gradient that does not consist of rows alone. A step then visits every row whose gradient is not
 /// zero.
 #[derive(Debug, Clone)]
 pub struct Adam<T: Scalar> {
-    /// The first is that of parameters which no other has.
+    /// Group 0 has the parameters of no other group.
     groups: Vec<Group<T>>,
-    /// For each parameter of the store its group; those behind the end are in the first.
+    /// For each parameter of the store, its group; parameters beyond the end are in group 0.
     members: Vec<usize>,
     steps: u64,
     memory: Memory<T>,
 }
 
-/// Makes [`Adam`] with decoupled weight decay (Loshchilov and Hutter 2019, algorithm 2): before each step a parameter is
-/// multiplied by `1 - rate decay`. An element whose gradient is infinite or NaN does not decay either, nor does a row of
-/// a lazy parameter without gradient.
+/// Makes an [`Adam`] with decoupled weight decay (Loshchilov and Hutter 2019, algorithm 2). Before each step a
+/// parameter is multiplied by `1 - rate decay`. There is no decay of an element whose gradient is infinite or NaN, or
+/// of a row without gradient of a lazy parameter.
 #[derive(Debug, Clone, Copy)]
 pub struct AdamW;
 
-/// Constants of [`Adam`].
+/// The constants of [`Adam`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AdamConfig {
     /// Decay of the first moment. Range: at least 0 and less than 1.
@@ -54,17 +54,17 @@ pub struct AdamConfig {
 }
 
 impl Default for AdamConfig {
-    /// 0.9, 0.999, 1e-8.
+    /// The usual constants 0.9, 0.999 and 1e-8.
     fn default() -> Self {
         AdamConfig { beta1: 0.9, beta2: 0.999, eps: 1e-8 }
     }
 }
 
 impl AdamConfig {
-    /// Whether the constants are in their ranges.
+    /// Checks that the constants are in their ranges.
     ///
     /// # Errors
-    /// If one is not, with its name.
+    /// If one is not. The error has its name.
     pub fn check(&self) -> Result<(), SettingError> {
         check_share("beta1", self.beta1)?;
         check_share("beta2", self.beta2)?;
@@ -77,7 +77,9 @@ impl AdamConfig {
 struct Group<T> {
     config: AdamConfig,
     decay: f64,
-    /// The [`correction`] of each step of a row, from 1 on, as far as they are kept. Made for the first lazy parameter.
+    /// For each step of a row, from 1 on, the bias corrections of learning rate and epsilon:
+    /// `sqrt(1 - beta2^t) / (1 - beta1^t)` and `sqrt(1 - beta2^t)`. The last entry holds for all later steps. Filled
+    /// for the first lazy parameter.
     corrections: Vec<[T; 2]>,
 }
 
@@ -94,7 +96,7 @@ fn correction<T: Scalar>(config: AdamConfig, step: u32) -> [T; 2] {
 }
 
 impl<T: Scalar> Group<T> {
-    /// Most corrections that are kept. Beyond them, a beta2 above 0.9998 has them computed for each row.
+    /// Largest number of corrections, even if they are not yet 1. It matters only for a beta2 above 0.9998.
     const LONGEST: usize = 1 << 17;
 
     #[track_caller]
@@ -103,7 +105,7 @@ impl<T: Scalar> Group<T> {
         Group { config, decay, corrections: vec![] }
     }
 
-    /// Fills the corrections, if they are not.
+    /// Fills the corrections if they are empty.
     fn correct_rows(&mut self) {
         while self.corrections.len() < Self::LONGEST && self.corrections.last() != Some(&[T::ONE; 2]) {
             self.corrections.push(correction(self.config, self.corrections.len() as u32 + 1));
@@ -119,7 +121,7 @@ impl<T: Scalar> Group<T> {
         }
     }
 
-    /// A step at this learning rate of a parameter with this factor of the decay, without correction of the bias.
+    /// A step at this learning rate, for a parameter with this factor of the decay, without bias correction.
     fn update(&self, rate: f64, decay: f64) -> Update<T> {
         let (AdamConfig { beta1, beta2, eps: epsilon }, decay) = (self.config, self.decay * decay);
         Update {
@@ -134,18 +136,18 @@ impl<T: Scalar> Group<T> {
 }
 
 impl<T: Scalar> Adam<T> {
-    /// An optimiser that has seen nothing.
+    /// A new optimizer with empty state and without weight decay.
     ///
     /// # Panics
-    /// If [`AdamConfig::check`] finds something.
+    /// If [`AdamConfig::check`] fails.
     #[track_caller]
     pub fn new(config: AdamConfig) -> Self {
         AdamW::new(config, 0.0)
     }
 
-    /// Makes a further group of the parameters whose name `which` chooses and that are in none yet, as PyTorch's
-    /// `add_param_group`, and returns how many these are. Groups are numbered from 1 on; number 0 are the parameters in no
-    /// other. Call it before the first step.
+    /// Adds a parameter group (PyTorch's `add_param_group`) and returns its number of parameters. It gets the
+    /// parameters whose name `which` selects and that are still in group 0. Groups are numbered from 1; group 0 has all
+    /// other parameters. Call it before the first step.
     ///
     /// ```
     /// use raygrad_autograd::{Gradient, Tensor};
@@ -164,7 +166,7 @@ impl<T: Scalar> Adam<T> {
     /// ```
     ///
     /// # Panics
-    /// If [`AdamConfig::check`] finds something, or the decay is not within 0 to 1e30.
+    /// If [`AdamConfig::check`] fails, or the decay is not in 0 to 1e30.
     #[track_caller]
     pub fn add_group(
         &mut self,
@@ -190,10 +192,11 @@ impl<T: Scalar> Adam<T> {
         self.steps
     }
 
-    /// As [`update`](Optimizer::update), with a learning rate for each group: `rate` gives that of a number.
+    /// As [`update`](Optimizer::update), with a learning rate for each group: `rate` maps the number of a group to its
+    /// learning rate.
     ///
     /// # Panics
-    /// As there.
+    /// Where [`update`](Optimizer::update) panics.
     #[track_caller]
     pub fn update_groups(
         &mut self,
@@ -249,12 +252,12 @@ impl<T: Scalar> Optimizer<T> for Adam<T> {
 }
 
 impl AdamW {
-    /// An optimiser that has seen nothing. `decay` is the part of a parameter that goes at each step at learning rate 1,
-    /// customarily 0.01; parameters can have a factor of their own, such as 0 for biases
+    /// A new optimizer with empty state. `decay` is the fraction by which a step at learning rate 1 shrinks a
+    /// parameter. The usual value is 0.01. Parameters can scale it, such as 0 for biases
     /// ([`Params::set_weight_decay_scale`](crate::Params::set_weight_decay_scale)).
     ///
     /// # Panics
-    /// If [`AdamConfig::check`] finds something, or the decay is not within 0 to 1e30.
+    /// If [`AdamConfig::check`] fails, or the decay is not in 0 to 1e30.
     #[allow(clippy::new_ret_no_self)] // PyTorch's name, for a constructor
     #[track_caller]
     pub fn new<T: Scalar>(config: AdamConfig, decay: f64) -> Adam<T> {
@@ -263,16 +266,16 @@ impl AdamW {
     }
 }
 
-/// One step's constants.
+/// The constants of one step.
 #[derive(Clone, Copy)]
 struct Update<T> {
     beta: [T; 2],
     rest: [T; 2],
     rate: T,
     epsilon: T,
-    /// What weight decay leaves of a parameter.
+    /// Factor of weight decay.
     keep: T,
-    /// A decaying parameter is 0 below this.
+    /// Decaying parameters smaller than this become 0.
     tiniest: T,
 }
 

@@ -1,26 +1,26 @@
-//! Bounds on gradients.
+//! Gradient clipping.
 
 use super::limits::flushed;
 use raygrad_autograd::{Gradient, RowGrad, RowSums};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, simd};
 use std::sync::Arc;
 
-/// What [`clip_norm`] found and did.
+/// The result of [`clip_norm`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Clipped {
-    /// The norm of all finite elements together before.
+    /// The common norm of all finite elements before clipping.
     pub norm: f64,
-    /// What they were multiplied by: 1 if the norm was within its bound.
+    /// The factor of all finite elements: 1 if the norm was within its bound.
     pub factor: f64,
-    /// Elements that are infinite or NaN and were left as they are.
+    /// Number of elements that are infinite or NaN, which are not changed.
     pub bad: usize,
 }
 
-/// Limits every element to `-bound..=bound`, and returns how many it changed.
+/// Limits every element to `-bound..=bound`, and returns the number of changed elements
+/// (`torch.nn.utils.clip_grad_value_`).
 ///
-/// Infinite elements and NaN stay as they are: optimisers leave what has such a gradient alone and count it, whereas a
-/// step of full length in the direction of an overflow would be a guess. Sparse shares are added up first, as for
-/// [`clip_norm`].
+/// Infinite elements and NaN stay unchanged. Optimizers skip and count elements with such a gradient; a full step in
+/// the direction of an overflow would be a guess. Sparse contributions are summed first, as for [`clip_norm`].
 ///
 /// # Panics
 /// If `bound` is negative or NaN.
@@ -30,23 +30,24 @@ pub fn clip_value<T: Scalar>(grads: &mut [Gradient<T>], bound: f64) -> usize {
     with_values(grads, |values| limit_values(values, T::from_f64(bound)))
 }
 
-/// The Euclidean norm of all finite elements together, and how many others there are.
+/// The common Euclidean norm of all finite elements, and the number of other elements.
 ///
-/// Elements are scaled by the largest one and squares added in f64: nothing overflows or underflows unless the norm does.
+/// Elements are scaled by the largest one, and squares are added in f64. So the sum overflows or underflows only if the
+/// norm does.
 pub fn global_norm<T: Scalar>(grads: &[Gradient<T>]) -> (f64, usize) {
     let (largest, sum, bad) = with_values(&mut grads.to_vec(), |values| parts(values));
     (largest * sum.sqrt(), bad)
 }
 
-/// Multiplies all gradients by the factor that brings their common norm down to `bound`, if it is above (Pascanu,
-/// Mikolov and Bengio 2013, algorithm 1).
+/// Gradient clipping by norm: scales all gradients so that their common norm is at most `bound` (Pascanu, Mikolov and
+/// Bengio 2013, algorithm 1; `torch.nn.utils.clip_grad_norm_`).
 ///
-/// The norm is that of the finite elements; infinite ones and NaN stay as they are, so that one bad element neither sets
-/// all others to 0 nor goes unnoticed: optimisers leave what has such a gradient alone and count it. Products below 1e-30
+/// The norm is that of the finite elements. Infinite elements and NaN stay unchanged, so that one bad element neither
+/// zeroes all others nor is hidden. Optimizers skip and count elements with such a gradient. Products below 1e-30
 /// (1e-300 in f64) become 0.
 ///
-/// The norm of a sum is not that of its shares, so these are added up first: a gradient of rows then has each row once,
-/// one with other shares is dense.
+/// The norm of a sum is not that of its contributions, so these are summed first. A gradient of rows then has each row
+/// once; a gradient with other contributions is dense.
 ///
 /// ```
 /// use raygrad_autograd::{Gradient, Tensor};
@@ -66,7 +67,7 @@ pub fn clip_norm<T: Scalar>(grads: &mut [Gradient<T>], bound: f64) -> Clipped {
     with_values(grads, |values| limit_norm(values, bound))
 }
 
-/// Runs `f` on all values of the gradients, each of which is then one dense tensor, or rows of which there is one each.
+/// Runs `f` on the values of all gradients. Each is one dense tensor, or rows with each index once.
 fn with_values<T: Scalar, R>(grads: &mut [Gradient<T>], f: impl FnOnce(&mut [Tensor<T>]) -> R) -> R {
     let (mut forms, mut values) = (vec![], vec![]);
     for (place, grad) in grads.iter_mut().enumerate().filter(|(_, grad)| !grad.is_zero()) {
@@ -132,7 +133,8 @@ fn limit_norm<T: Scalar>(values: &mut [Tensor<T>], bound: f64) -> Clipped {
     Clipped { norm, factor, bad }
 }
 
-/// The largest finite magnitude, the sum of the squares of all finite elements divided by it, and how many are not finite.
+/// The largest finite magnitude, the sum of squares of all finite elements divided by it, and the number of other
+/// elements.
 fn parts<T: Scalar>(grads: &[Tensor<T>]) -> (f64, f64, usize) {
     let (mut largest, mut bad) = (T::ZERO, 0);
     for grad in grads {
@@ -145,7 +147,7 @@ fn parts<T: Scalar>(grads: &[Tensor<T>]) -> (f64, f64, usize) {
     (largest, sum, bad)
 }
 
-/// The largest finite magnitude, and how many elements are not finite.
+/// The largest finite magnitude, and the number of elements that are not finite.
 fn extent<T: Scalar>(x: &[T]) -> (T, usize) {
     simd::dispatch(
         #[inline(always)]

@@ -1,12 +1,12 @@
-//! Averages of parameters.
+//! Exponential moving averages of parameters.
 
 use super::limits::flushed;
 use super::{OptimizerState, StateError};
 use crate::Params;
 use raygrad_tensor::{Scalar, simd};
 
-/// The exponential moving average of parameters: `a = decay a + (1 - decay) x` after each step. It is often a better
-/// model than the parameters themselves, whose last steps are noise (Polyak and Juditsky 1992).
+/// An exponential moving average (EMA) of parameters: `a = decay a + (1 - decay) x` after each step. It is often a
+/// better model than the last parameters, which are noisy (Polyak and Juditsky 1992).
 ///
 /// ```
 /// use raygrad_autograd::Tensor;
@@ -37,17 +37,17 @@ impl<T: Scalar> Ema<T> {
         Ema { average: params.clone(), decay, warmup: false, steps: 0 }
     }
 
-    /// The same with a shorter memory at first, so that the random start is soon forgotten: the decay of step `t`, from
-    /// 0, is at most `(1 + t) / (10 + t)`.
+    /// The same average with a smaller decay at first, so that it soon forgets the random start. In step `t`, from 0,
+    /// the decay is at most `(1 + t) / (10 + t)`.
     pub fn with_warmup(self) -> Self {
         Ema { warmup: true, ..self }
     }
 
-    /// Takes the parameters after a step into account, and returns how many elements were left alone because the
-    /// parameter is infinite or NaN. Averages below 1e-30 (1e-300 in f64) become 0.
+    /// Adds the parameters after a step to the average. Returns the number of skipped elements, whose parameter is
+    /// infinite or NaN. Averages below 1e-30 (1e-300 in f64) become 0.
     ///
     /// # Panics
-    /// If names or shapes of the parameters have changed; then nothing else has.
+    /// If names or shapes of the parameters have changed. The average then does not change.
     #[track_caller]
     pub fn update(&mut self, params: &Params<T>) -> usize {
         self.average.check_fits(params);
@@ -64,7 +64,7 @@ impl<T: Scalar> Ema<T> {
         &self.average
     }
 
-    /// The averages and how many steps they have taken, so that a run can go on later.
+    /// The averages and the number of steps, to resume a run.
     pub fn state(&self) -> OptimizerState<T> {
         let mut state = OptimizerState::default();
         state.put_counts("", "steps", vec![self.steps]);
@@ -77,7 +77,7 @@ impl<T: Scalar> Ema<T> {
     /// Resumes from a [`state`](Self::state).
     ///
     /// # Errors
-    /// If the state is that of other parameters; then nothing changes.
+    /// If the state belongs to other parameters. The average then does not change.
     pub fn load_state(&mut self, state: &OptimizerState<T>) -> Result<(), StateError> {
         let mut state = state.clone();
         let (steps, mut values) = (state.take_steps()?, vec![]);

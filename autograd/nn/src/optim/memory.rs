@@ -1,4 +1,4 @@
-//! What an optimiser remembers of parameters, and the steps that use it.
+//! The state of an optimizer, and the steps that use it.
 
 use super::rule::{LINE, Rule, Shared, Table, move_all};
 use super::{OptimizerState, ParamUpdate, StateError, UpdateReport};
@@ -7,48 +7,48 @@ use raygrad_autograd::RowSums;
 use raygrad_tensor::{Pool, Scalar, parallel, simd};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// What an optimiser remembers of the parameters of a store.
+/// The state of an optimizer for the parameters of a store.
 #[derive(Debug, Clone)]
 pub(super) struct Memory<T: Scalar> {
-    /// The names of the numbers that are remembered of each element.
+    /// The names of the state numbers of each element.
     kinds: &'static [&'static str],
-    /// Whether a state has the numbers of steps.
+    /// Whether a saved state has step counts.
     counts_steps: bool,
     slots: Vec<Slot<T>>,
-    /// For gradients that have to be added up.
+    /// For gradients that have to be summed.
     pool: Pool<T>,
 }
 
-/// What it remembers of one parameter. One that is moved as a whole is a table of one row.
+/// The state of one parameter. A parameter that is updated as a whole is a table of one row.
 #[derive(Debug, Clone)]
 struct Slot<T> {
-    /// For each row the numbers of one kind after those of another.
+    /// For each row, the numbers of the first kind, then those of the next.
     numbers: Lines<T>,
     /// Steps of each row; empty before the parameter's first step.
     steps: Vec<u32>,
-    /// For each part of the table that is summed by itself; nothing between steps.
+    /// For each part of the table, its row sums; empty between steps.
     sums: Vec<RowSums<T>>,
 }
 
-/// Elements of a whole parameter that one task moves.
+/// Elements of a whole parameter for one task.
 pub(super) const CHUNK: usize = 1 << 14;
 
-/// Rows that one task visits: so many that the levels of a hash grid, whose sums are still in the caches of the core that
-/// added them up, are not torn apart, and so few that a large voxel grid keeps several cores busy.
+/// Rows for one task. The levels of a hash grid must not be split, since the core that summed them has the sums in its
+/// caches. A large voxel grid must occupy several cores.
 const ROWS: usize = 1 << 16;
 
 impl<T: Scalar> Memory<T> {
-    /// Nothing remembered.
+    /// An empty state.
     pub fn new(kinds: &'static [&'static str], counts_steps: bool) -> Self {
         Memory { kinds, counts_steps, slots: vec![], pool: Pool::new() }
     }
 
-    /// Moves a parameter by the rule for its next step, counted from 1: `whole`, or `row` for each row of a lazy one. `M` is
-    /// the number of kinds.
+    /// Updates a parameter by the rule for its next step, counted from 1: `whole`, or `row` for each row of a lazy
+    /// parameter. `M` is the number of kinds.
     ///
     /// # Panics
-    /// If the parameter has another size than at its first step, or there is more than one kind and the parameter is lazy
-    /// and was not, or the reverse.
+    /// If the parameter has another size than at its first step. Also if the parameter has become lazy, or is not lazy
+    /// any more, and there is more than one kind.
     #[track_caller]
     pub fn update<const M: usize, R: Rule<T, M>>(
         &mut self,
@@ -84,7 +84,7 @@ impl<T: Scalar> Memory<T> {
         report.count(name, moved, skipped);
     }
 
-    /// What is remembered of the parameters of this store.
+    /// The state of the parameters of this store.
     pub fn state(&self, params: &Params<T>) -> OptimizerState<T> {
         let mut state = OptimizerState::default();
         for (((name, value), id), slot) in params.iter().zip(params.ids()).zip(&self.slots) {
@@ -108,10 +108,11 @@ impl<T: Scalar> Memory<T> {
         state
     }
 
-    /// The same with what a state has of the parameters of this store in place of what is remembered.
+    /// A copy with the state of this store's parameters replaced by a saved one.
     ///
     /// # Errors
-    /// If an entry is missing, unknown or of another shape, or belongs to a lazy parameter that is not lazy, or the reverse.
+    /// If an entry is missing, unknown or of another shape. If it belongs to a lazy parameter that is not lazy here, or
+    /// the reverse.
     pub fn loaded(&self, params: &Params<T>, mut state: OptimizerState<T>) -> Result<Self, StateError> {
         let mut slots = vec![];
         for ((name, value), id) in params.iter().zip(params.ids()) {
@@ -148,7 +149,7 @@ impl<T: Scalar> Memory<T> {
     }
 }
 
-/// What the numbers of steps of a parameter are called in a state.
+/// The name of a parameter's step counts in a saved state.
 fn steps_name(lazy: bool) -> &'static str {
     if lazy { "row_steps" } else { "step" }
 }
@@ -158,7 +159,7 @@ impl<T: Scalar> Slot<T> {
         Slot { numbers: Lines::zeros(numbers), steps: vec![0; rows], sums: vec![] }
     }
 
-    /// Moves all elements; returns how many were moved and left alone.
+    /// Updates all elements. Returns the numbers of updated and skipped ones.
     #[track_caller]
     fn move_whole<const M: usize, R: Rule<T, M>>(
         &mut self,
@@ -180,8 +181,8 @@ impl<T: Scalar> Slot<T> {
         [len - skipped, skipped]
     }
 
-    /// Moves the rows whose gradient is not zero; returns how many of their elements were moved and left alone. Parts of
-    /// the table are worked on side by side, and moved while their sums are in the caches.
+    /// Updates the rows whose gradient is not zero. Returns the numbers of updated and skipped elements of these rows.
+    /// Parts of the table run in parallel, and are updated while their sums are in the caches.
     #[track_caller]
     fn move_rows<const M: usize, R: Rule<T, M>>(
         &mut self,
@@ -236,8 +237,8 @@ impl<T: Scalar> Slot<T> {
     }
 }
 
-/// Numbers that begin where a line of the caches begins, so that a row of a power of two of them takes as few lines as it
-/// can. (A clone may begin elsewhere.)
+/// Numbers that start at a cache line, so that a row whose length is a power of two takes as few lines as possible. (A
+/// clone may start elsewhere.)
 #[derive(Debug, Clone)]
 struct Lines<T> {
     values: Vec<T>,

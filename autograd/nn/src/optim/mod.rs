@@ -1,4 +1,4 @@
-//! Optimisers and what belongs to them: schedules, clipping, averages.
+//! Optimizers, learning-rate schedules, gradient clipping and parameter averages.
 
 mod adam;
 mod clip;
@@ -26,27 +26,27 @@ use raygrad_autograd::{Gradient, RowShare};
 use raygrad_tensor::{Pool, Scalar, Tensor};
 use std::borrow::Cow;
 
-/// One parameter that an optimiser is to move.
+/// One parameter to update, with its gradient and settings.
 #[derive(Debug)]
 pub struct ParamUpdate<'a, T: Scalar> {
-    /// Which parameter of its store it is.
+    /// Its position in the store, from 0.
     pub slot: usize,
     /// Its name.
     pub name: &'a str,
     /// Its value.
     pub value: &'a mut Tensor<T>,
-    /// Its gradient, of the same shape and not without a share.
+    /// Its gradient, of the same shape and not empty.
     pub grad: &'a Gradient<T>,
-    /// Its learning rate.
+    /// Its learning rate, including its lr scale.
     pub rate: f64,
-    /// A factor of the optimiser's weight decay.
+    /// Its factor of the optimizer's weight decay.
     pub decay: f64,
-    /// Whether only the rows whose gradient is not zero are to be visited ([`Params::set_lazy`]).
+    /// Whether to update only the rows whose gradient is not zero ([`Params::set_lazy`]).
     pub lazy: bool,
 }
 
 impl<'a, T: Scalar> ParamUpdate<'a, T> {
-    /// The gradient as one tensor, from `pool` if it is not one already.
+    /// The gradient as one dense tensor. A sparse one is summed into a tensor from `pool`.
     pub fn dense_grad(&self, pool: &Pool<T>) -> Cow<'a, Tensor<T>> {
         match self.grad.dense() {
             Some(dense) if self.grad.is_dense() => Cow::Borrowed(dense),
@@ -54,7 +54,7 @@ impl<'a, T: Scalar> ParamUpdate<'a, T> {
         }
     }
 
-    /// The parameter as a table `[rows, features]`, of one row unless it is lazy.
+    /// The shape of the parameter as a table `[rows, features]`; one row unless it is lazy.
     fn table(&self) -> [usize; 2] {
         match self.value.shape() {
             [rows, row @ ..] if self.lazy => [*rows, row.iter().product()],
@@ -62,8 +62,8 @@ impl<'a, T: Scalar> ParamUpdate<'a, T> {
         }
     }
 
-    /// The shares of a gradient that consists of rows, and the rows of the parts that can be added up by themselves; `None`
-    /// where shares disagree on these, or where there are others.
+    /// The contributions to a gradient that consists of rows, and the rows of the parts that can be summed separately.
+    /// `None` if contributions disagree on the parts, or if there are others.
     #[allow(clippy::type_complexity)]
     fn row_parts(&self) -> (Option<Vec<&'a dyn RowShare<T>>>, Option<Vec<usize>>) {
         let [rows, _] = self.table();
@@ -76,21 +76,21 @@ impl<'a, T: Scalar> ParamUpdate<'a, T> {
     }
 }
 
-/// Moves parameters against their gradients.
+/// Updates parameters along their negative gradients.
 ///
-/// Every optimiser takes every gradient ([`Gradient`]): dense ones, rows of a table, and both. What it does depends on
-/// the gradient's value alone, unless a parameter is lazy ([`Params::set_lazy`]). Frozen parameters rest, and so does one
-/// whose gradient has no share because nothing depends on it; others move with the learning rate and the weight decay
-/// of their own ([`Params::set_lr_scale`], [`Params::set_weight_decay_scale`]).
+/// Every optimizer takes every gradient ([`Gradient`]): dense, rows of a table, or both. The result depends on the
+/// gradient's value alone, unless a parameter is lazy ([`Params::set_lazy`]). An optimizer skips frozen parameters, and
+/// parameters whose gradient is [zero](Gradient::is_zero). Each parameter can scale the learning rate and the weight
+/// decay ([`Params::set_lr_scale`], [`Params::set_weight_decay_scale`]).
 ///
-/// All optimizers here share three rules.
-/// - An element whose gradient or new value is infinite or NaN keeps its value and its state, and is counted. Its row or
-///   parameter counts the step all the same. This holds for lazy and other parameters.
+/// All optimizers here share three rules:
+/// - An element whose gradient or new value is infinite or NaN keeps its value and its state, and is counted. Its row
+///   or parameter counts the step all the same. This holds for lazy and other parameters.
 /// - State below 1e-30 (1e-300 in f64) becomes 0, so that no denormal numbers slow the update down.
-/// - The bits are the same at any number of threads.
+/// - The bits are the same for any number of threads.
 ///
-/// [`Bound::backward`](crate::Bound::backward) gives the gradients and lets go of the parameters, which can then be
-/// moved in place. While a tape or a variable still holds one, an update copies it first.
+/// [`Bound::backward`](crate::Bound::backward) returns the gradients and releases the parameters, so that they are
+/// updated in place. If a tape or a variable still holds a parameter, an update copies it first.
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor};
@@ -109,23 +109,23 @@ impl<'a, T: Scalar> ParamUpdate<'a, T> {
 /// assert!((params.get(x).item() - 2.0).abs() < 1e-3);
 /// ```
 pub trait Optimizer<T: Scalar> {
-    /// Moves the parameters of a store at learning rate `rate`. An implementation goes through [`Params::updates`].
+    /// Updates the parameters of a store at learning rate `rate`. Implementations use [`Params::updates`].
     ///
     /// # Panics
-    /// If there is not one gradient of the same shape for each parameter that is not frozen or the rate is not within 0 to
-    /// 1e30; then nothing changes. If a parameter has another size than at its first step, or is lazy and was not, or the
-    /// reverse.
+    /// If there is not one gradient of the same shape for each parameter that is not frozen. If the rate is not in 0 to
+    /// 1e30. No parameter changes in these cases. Also if a parameter has another size than at its first step, has
+    /// become lazy, or is not lazy any more.
     #[track_caller]
     fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport;
 
-    /// What the optimiser remembers of the parameters of this store, so that a run can go on later.
+    /// The state of the optimizer for the parameters of this store, to resume a run.
     fn state(&self, params: &Params<T>) -> OptimizerState<T>;
 
-    /// Remembers what [`state`](Self::state) gave, in place of everything else: the next steps then are, bit for bit,
-    /// what they would have been. Parameters that were [lazy](Params::set_lazy) have to be so before.
+    /// Replaces the optimizer's state with a saved [`state`](Self::state). The next steps are then those of the saved
+    /// run, bit for bit. First make the same parameters [lazy](Params::set_lazy) as in that run.
     ///
     /// # Errors
-    /// If the state is that of another kind of optimiser or of other parameters, or of a lazy parameter that is not lazy,
-    /// or the reverse; then nothing changes.
+    /// If the state belongs to another kind of optimizer or to other parameters. If it belongs to a lazy parameter that
+    /// is not lazy here, or the reverse. The optimizer then does not change.
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError>;
 }

@@ -1,25 +1,25 @@
-//! What an update did.
+//! The result of an update.
 
 use std::fmt;
 
-/// What [`Optimizer::update`](crate::Optimizer::update) did, in elements of parameters.
+/// The result of [`Optimizer::update`](crate::Optimizer::update), in elements of parameters.
 ///
-/// An element whose gradient is infinite or NaN stays where it is. That saves a run from a single overflow, but a run
-/// that has diverged would stand still without a word: so the report asks to be looked at. [`check`](Self::check) ends a
-/// run at the first bad gradient; who wants to go on looks whether it [`has_only_non_finite`](Self::has_only_non_finite) for many steps.
-#[must_use = "elements with a non-finite gradient are not updated: `check` is an error if there are any"]
+/// An optimizer skips an element whose gradient is infinite or NaN. So a run survives a single overflow, but a diverged
+/// run would stop silently. Look at the report in each step: [`check`](Self::check) fails at the first skipped element.
+/// A run that should tolerate some can test [`has_only_non_finite`](Self::has_only_non_finite) over many steps.
+#[must_use = "elements whose gradient is infinite or NaN stay where they are: `check` says whether there are any"]
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct UpdateReport {
-    /// Elements that were moved. Of a lazy parameter those of the rows that got a gradient.
+    /// Number of updated elements. For a lazy parameter, those of the rows with a gradient.
     pub moved: usize,
-    /// Elements that were left alone, because their gradient or what would have come of it is infinite or NaN.
+    /// Number of skipped elements, whose gradient or new value is infinite or NaN.
     pub skipped: usize,
-    /// The parameters that these belong to, and how many they are.
+    /// The parameters with skipped elements, and the number of these.
     pub bad: Vec<(String, usize)>,
 }
 
 impl UpdateReport {
-    /// Takes account of one parameter.
+    /// Adds the numbers of one parameter.
     pub fn count(&mut self, name: &str, moved: usize, skipped: usize) {
         self.moved += moved;
         self.skipped += skipped;
@@ -28,25 +28,25 @@ impl UpdateReport {
         }
     }
 
-    /// How many elements were moved.
+    /// The number of updated elements.
     ///
     /// # Errors
-    /// If others were left alone.
+    /// If elements were skipped.
     pub fn check(self) -> Result<usize, NonFinite> {
         if self.skipped == 0 { Ok(self.moved) } else { Err(NonFinite(self)) }
     }
 
-    /// Whether there were gradients and none of them was of any use. Once in a while that is an overflow; at every step
-    /// the run has diverged.
+    /// Whether all gradients were infinite or NaN, and there were some. One such step is an overflow; if it is every
+    /// step, the run has diverged.
     pub fn has_only_non_finite(&self) -> bool {
         self.moved == 0 && self.skipped > 0
     }
 }
 
-/// Gradients that are infinite or NaN.
+/// The error of an update with gradients that are infinite or NaN.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NonFinite(
-    /// What the update did.
+    /// The result of the update.
     pub UpdateReport,
 );
 

@@ -1,16 +1,16 @@
-//! How the elements of a parameter move: by one rule, whether all of them do or those of some rows.
+//! The update of elements by one rule: of all elements of a parameter, or of some rows.
 
 use raygrad_tensor::{Scalar, simd};
 use std::marker::PhantomData;
 
-/// How an optimiser moves one element, of which it remembers `M` numbers.
+/// The update of one element, with `M` state numbers.
 pub(super) trait Rule<T: Scalar, const M: usize>: Sync {
-    /// The new value of an element `x` and what is remembered of it, after a step against `grad`.
+    /// The new value of an element `x` and its new state, after a step against `grad`.
     fn element(&self, x: T, grad: T, memory: [T; M]) -> (T, [T; M]);
 }
 
-/// A step of one element: its new value and memory, and whether it is left alone with what is remembered of it, because its
-/// gradient or its new value is infinite or NaN.
+/// A step of one element: its new value and state, and whether it is skipped. It is skipped, and keeps its state, if
+/// its gradient or new value is infinite or NaN.
 #[inline(always)]
 fn step<T: Scalar, const M: usize>(rule: &impl Rule<T, M>, x: T, grad: T, memory: [T; M]) -> (T, [T; M], bool) {
     let (moved, mut new) = rule.element(x, grad, memory);
@@ -21,7 +21,7 @@ fn step<T: Scalar, const M: usize>(rule: &impl Rule<T, M>, x: T, grad: T, memory
     (if good { moved } else { x }, new, !good)
 }
 
-/// Moves all these elements, whose memory of each kind lies apart; returns how many were left alone.
+/// Updates all these elements, whose state has one slice for each kind. Returns the number of skipped elements.
 pub(super) fn move_all<T: Scalar, const M: usize>(
     x: &mut [T],
     grad: &[T],
@@ -53,8 +53,8 @@ pub(super) fn move_all<T: Scalar, const M: usize>(
     )
 }
 
-/// Moves `W` elements of a row from place `at` on, whose memory of one kind lies behind that of another; returns how many
-/// were left alone.
+/// Updates `W` elements of a row from position `at` on, whose state has one kind after the other. Returns the number of
+/// skipped elements.
 #[inline(always)]
 fn move_piece<T: Scalar, const M: usize, const W: usize>(
     x: &mut [T],
@@ -90,26 +90,26 @@ fn move_piece<T: Scalar, const M: usize, const W: usize>(
     skipped
 }
 
-/// A table and what is remembered of its rows, for several tasks that move rows of their own.
+/// A table and the state of its rows, for several tasks that each update other rows.
 pub(super) struct Table<'a, T> {
     /// Elements of a row.
     pub features: usize,
     pub values: Shared<'a, T>,
-    /// For each row the numbers of one kind behind those of another: one place in memory to visit.
+    /// For each row, the numbers of the first kind, then those of the next, so that they are at one place in memory.
     pub memory: Shared<'a, T>,
     /// Steps of each row.
     pub steps: Shared<'a, u32>,
 }
 
-/// How many rows ahead of the one that moves are prefetched: they lie at random places.
+/// Distance of prefetching, in rows: rows are at random places.
 const AHEAD: usize = 16;
 
 impl<T: Scalar> Table<'_, T> {
-    /// Moves those of `rows`, counted from `first` on, whose gradient `[rows, features]` is not zero, by the rule for
-    /// their next step. Returns how many of their elements were moved and left alone.
+    /// Updates those of `rows`, counted from `first` on, whose gradient `[rows, features]` is not zero, by the rule for
+    /// their next step. Returns the numbers of updated and skipped elements.
     ///
     /// # Safety
-    /// `rows` has no row twice, and nothing else accesses them meanwhile.
+    /// `rows` has no row twice, and no other code accesses these rows meanwhile.
     #[inline(always)]
     pub unsafe fn move_rows<const M: usize, R: Rule<T, M>>(
         &self,
@@ -133,7 +133,7 @@ impl<T: Scalar> Table<'_, T> {
     /// As [`move_rows`](Self::move_rows), in pieces of `W` elements.
     ///
     /// # Safety
-    /// As there.
+    /// As for [`move_rows`](Self::move_rows).
     #[inline(always)]
     unsafe fn move_rows_by<const M: usize, const W: usize, R: Rule<T, M>>(
         &self,
@@ -178,10 +178,10 @@ impl<T: Scalar> Table<'_, T> {
     }
 }
 
-/// Bytes of a line of the caches.
+/// Bytes of a cache line.
 pub(super) const LINE: usize = 64;
 
-/// A slice that several tasks write to, each to elements of its own.
+/// A slice that several tasks write to, each to other elements.
 pub(super) struct Shared<'a, T> {
     first: *mut T,
     len: usize,
@@ -203,7 +203,7 @@ impl<'a, T> Shared<'a, T> {
     /// No other borrow of any of them may be alive.
     ///
     /// # Panics
-    /// If there are not as many.
+    /// If there are fewer.
     #[inline(always)]
     #[allow(clippy::mut_from_ref)] // that is its point
     // SAFETY: kept by the callers, whose elements are all different.
@@ -213,7 +213,7 @@ impl<'a, T> Shared<'a, T> {
         unsafe { std::slice::from_raw_parts_mut(self.first.add(start), len) }
     }
 
-    /// Asks the caches for the elements from `start` on.
+    /// Prefetches the elements from `start` on.
     #[inline(always)]
     fn prefetch(&self, start: usize, len: usize) {
         let line = LINE / size_of::<T>();

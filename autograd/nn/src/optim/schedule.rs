@@ -1,30 +1,30 @@
-//! Learning rates over the course of a run.
+//! Learning-rate schedules.
 
 use super::SettingError;
 use super::settings::{check, check_rate};
 use serde::{Deserialize, Serialize};
 
-/// A learning rate over the course of a run, as a function of the fraction of the budget (steps, time, samples) that is
-/// done: the same schedule then fits a short run and a long one.
+/// A learning-rate schedule: the learning rate as a function of the completed fraction of the budget (steps, time or
+/// samples). So one schedule fits short and long runs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Schedule {
-    /// The same rate throughout.
+    /// A constant rate.
     Constant {
         /// Learning rate. Range: 0 to 1e30.
         rate: f64,
     },
-    /// `from + (to - from) fraction`, after a linear rise from 0. With `to` equal to `from`, constant after a
-    /// warm-up.
+    /// Linear: `from + (to - from) fraction`, after a linear warm-up from 0. With `to` equal to `from` it is constant
+    /// after the warm-up.
     Linear {
         /// Learning rate at the start. Range: 0 to 1e30.
         from: f64,
         /// Learning rate at the end. Range: 0 to 1e30.
         to: f64,
-        /// Fraction of the run over which the rate rises from 0. Range: 0 to 1.
+        /// Fraction of the run for the warm-up, over which the rate rises from 0. Range: 0 to 1.
         warmup: f64,
     },
-    /// `from * factor^k` after `k` times `every` of the run: a staircase, after a linear rise from 0.
+    /// A staircase: `from * factor^k` after `k` times `every` of the run, after a linear warm-up from 0.
     Step {
         /// Learning rate at the start. Range: 0 to 1e30.
         from: f64,
@@ -32,32 +32,32 @@ pub enum Schedule {
         factor: f64,
         /// Fraction of the run that a stair takes. Range: more than 0, to 1.
         every: f64,
-        /// Fraction of the run over which the rate rises from 0. Range: 0 to 1.
+        /// Fraction of the run for the warm-up, over which the rate rises from 0. Range: 0 to 1.
         warmup: f64,
     },
-    /// `from * (to / from)^fraction`, after a linear rise from 0.
+    /// Exponential decay: `from * (to / from)^fraction`, after a linear warm-up from 0.
     Exponential {
         /// Learning rate at the start. Range: more than 0, to 1e30.
         from: f64,
         /// Learning rate at the end. Range: more than 0, to 1e30.
         to: f64,
-        /// Fraction of the run over which the rate rises from 0. Range: 0 to 1.
+        /// Fraction of the run for the warm-up, over which the rate rises from 0. Range: 0 to 1.
         warmup: f64,
     },
-    /// Half a cosine wave from `from` to `to`, after a linear rise from 0 (Loshchilov and Hutter 2017, equation 5,
-    /// one period).
+    /// Cosine annealing: half a cosine wave from `from` to `to`, after a linear warm-up from 0 (Loshchilov and Hutter
+    /// 2017, equation 5, one period).
     Cosine {
         /// Learning rate at the start. Range: 0 to 1e30.
         from: f64,
         /// Learning rate at the end. Range: 0 to 1e30.
         to: f64,
-        /// Fraction of the run over which the rate rises from 0. Range: 0 to 1.
+        /// Fraction of the run for the warm-up, over which the rate rises from 0. Range: 0 to 1.
         warmup: f64,
     },
 }
 
 impl Schedule {
-    /// The name of the kind, under which its numbers are written in a file.
+    /// The name of the kind, as in configuration files.
     pub fn name(&self) -> &'static str {
         match self {
             Schedule::Constant { .. } => "constant",
@@ -68,8 +68,8 @@ impl Schedule {
         }
     }
 
-    /// The learning rate when `fraction` (0 to 1) of the run is done. The warm-up multiplies the rate, so it does not
-    /// delay what follows.
+    /// The learning rate after `fraction` (0 to 1) of the run. The warm-up multiplies the rate, so it does not delay
+    /// the rest of the schedule.
     pub fn lr(&self, fraction: f64) -> f64 {
         let fraction = fraction.clamp(0.0, 1.0);
         let rise = |warmup: f64| if fraction < warmup { fraction / warmup } else { 1.0 };
@@ -89,11 +89,11 @@ impl Schedule {
         }
     }
 
-    /// Whether the numbers are in their ranges: rates of 0 to 1e30, of which f32 still has multiples, and more than 0
-    /// where they are a ratio; fractions of the run of 0 to 1, a stair's of more than 0.
+    /// Checks that the numbers are in their ranges. Rates are 0 to 1e30, which leaves f32 room for multiples, and more
+    /// than 0 in [`Exponential`](Self::Exponential). Fractions of the run are 0 to 1, and `every` is more than 0.
     ///
     /// # Errors
-    /// If one is not, with its name.
+    /// If a number is not in its range. The error has its name.
     pub fn check(&self) -> Result<(), SettingError> {
         let check_warmup = |warmup| check("warmup", warmup, (0.0..=1.0).contains(&warmup), "0 to 1");
         let check_ratio = |name, rate| check(name, rate, rate > 0.0, "more than 0");
@@ -118,8 +118,8 @@ impl Schedule {
         }
     }
 
-    /// The learning rate of step number `step`, counted from 0, of `steps`: the fraction in the middle of the step, so
-    /// that a warm-up does not begin with a step of rate 0.
+    /// The learning rate of step `step`, counted from 0, of `steps`. It is that of the middle of the step, so that a
+    /// warm-up does not start with a rate of 0.
     pub fn at_step(&self, step: u64, steps: u64) -> f64 {
         self.lr((step as f64 + 0.5) / steps.max(1) as f64)
     }

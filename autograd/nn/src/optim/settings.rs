@@ -1,16 +1,16 @@
 //! Settings out of their range.
 
-/// A setting of an optimiser or a schedule that is out of its range.
+/// A setting of an optimizer or a schedule that is out of its range.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{name}` {what}")]
 pub struct SettingError {
-    /// The setting.
+    /// The name of the setting.
     pub name: &'static str,
-    /// What is wrong with it.
+    /// Its value and its range.
     pub what: String,
 }
 
-/// An error unless `value` is in the range, whose bounds `range` says in words. NaN is in none.
+/// An error unless `value` is in its range, which `range` describes. NaN is in no range.
 pub(crate) fn check(name: &'static str, value: f64, inside: bool, range: &str) -> Result<(), SettingError> {
     if inside { Ok(()) } else { Err(SettingError { name, what: format!("is {value:?}; use {range}") }) }
 }
@@ -20,12 +20,12 @@ pub(crate) fn check_share(name: &'static str, value: f64) -> Result<(), SettingE
     check(name, value, (0.0..1.0).contains(&value), "at least 0 and less than 1")
 }
 
-/// An error unless `value` is a weight decay or a learning rate: from 0 to 1e30, of which f32 still has multiples.
+/// An error unless `value` is a valid weight decay or learning rate: 0 to 1e30, which leaves f32 room for multiples.
 pub(crate) fn check_rate(name: &'static str, value: f64) -> Result<(), SettingError> {
     check(name, value, (0.0..=1e30).contains(&value), "0 to 1e30")
 }
 
-/// What constructors do with settings out of their range.
+/// Panics if a setting is out of its range; for constructors.
 #[track_caller]
 pub(crate) fn or_panic(checked: Result<(), SettingError>) {
     if let Err(error) = checked {

@@ -1,4 +1,4 @@
-//! Gradient descent with momentum.
+//! Stochastic gradient descent with momentum.
 
 use super::limits::{flushed, tiny};
 use super::memory::Memory;
@@ -10,34 +10,36 @@ use raygrad_autograd::Gradient;
 use raygrad_tensor::Scalar;
 use serde::{Deserialize, Serialize};
 
-/// Gradient descent: `h = g + decay x`, `v = momentum v + h`, `x = x - rate d`, where the direction `d` is `v`, or
-/// `h + momentum v` with Nesterov's look-ahead (Sutskever et al. 2013, in the form that PyTorch has).
+/// Stochastic gradient descent with momentum and weight decay: `h = g + decay x`, `v = momentum v + h`,
+/// `x = x - rate d`.
 ///
-/// Of a lazy parameter the rows without gradient stay, whatever their velocity and decay; without either, lazy or not is
-/// the same. Velocities below 1e-30 (1e-300 in f64) are set to 0.
+/// The direction `d` is `v`, or `h + momentum v` with Nesterov momentum (Sutskever et al. 2013, in PyTorch's form).
+///
+/// Rows without gradient of a lazy parameter do not change, for any velocity and decay. Without momentum and decay,
+/// lazy parameters are updated as others. Velocities below 1e-30 (1e-300 in f64) become 0.
 #[derive(Debug, Clone)]
 pub struct Sgd<T: Scalar> {
     config: SgdConfig,
     memory: Memory<T>,
 }
 
-/// Constants of [`Sgd`].
+/// The constants of [`Sgd`].
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct SgdConfig {
-    /// How much of the last step's velocity stays, at least 0 and less than 1; 0 is plain gradient descent, which
-    /// remembers nothing.
+    /// Fraction of the last step's velocity that stays, at least 0 and less than 1. 0 is plain gradient descent,
+    /// without state.
     pub momentum: f64,
-    /// Look ahead along the velocity.
+    /// Whether to use Nesterov momentum.
     pub nesterov: bool,
-    /// Weight decay: this times the parameter is added to the gradient.
+    /// Weight decay: `decay` times the parameter is added to the gradient. Range: 0 to 1e30.
     pub decay: f64,
 }
 
 impl SgdConfig {
-    /// Whether the constants are in their ranges.
+    /// Checks that the constants are in their ranges.
     ///
     /// # Errors
-    /// If one is not, with its name; also if there is a look-ahead without momentum.
+    /// If one is not; the error has its name. Also if Nesterov momentum is on and `momentum` is 0.
     pub fn check(&self) -> Result<(), SettingError> {
         check_share("momentum", self.momentum)?;
         check("momentum", self.momentum, !self.nesterov || self.momentum > 0.0, "more than 0 to look ahead")?;
@@ -46,10 +48,10 @@ impl SgdConfig {
 }
 
 impl<T: Scalar> Sgd<T> {
-    /// An optimiser that has seen nothing.
+    /// A new optimizer with empty state.
     ///
     /// # Panics
-    /// If [`SgdConfig::check`] finds something.
+    /// If [`SgdConfig::check`] fails.
     #[track_caller]
     pub fn new(config: SgdConfig) -> Self {
         or_panic(config.check());
@@ -88,14 +90,14 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
     }
 }
 
-/// One step's constants.
+/// The constants of one step.
 #[derive(Clone, Copy)]
 struct Update<T> {
     rate: T,
     momentum: T,
     nesterov: bool,
     decay: T,
-    /// A decaying parameter is 0 below this.
+    /// Decaying parameters smaller than this become 0.
     tiniest: T,
 }
 

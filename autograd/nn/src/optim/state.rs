@@ -1,4 +1,4 @@
-//! What an optimiser remembers, by the names of the parameters.
+//! The saved state of an optimizer, by the names of the parameters.
 
 #[cfg(feature = "files")]
 use crate::{Storage, files::bad_entry, storage::Part};
@@ -9,10 +9,10 @@ use raygrad_tensor::{Scalar, Tensor};
 use safetensors::tensor::{Dtype, SafeTensors};
 use std::collections::BTreeMap;
 
-/// What an optimiser remembers, so that a run can go on where it stopped, bit for bit.
+/// The saved state of an optimizer, to resume a run bit for bit.
 ///
-/// An entry is named after its parameter and what it is: `layer.weight.first`. Constants, such as those of
-/// [`AdamConfig`](crate::AdamConfig), are not part of it, and neither are the parameters.
+/// The name of an entry has the parameter and the kind of state: `layer.weight.first`. Neither constants, such as those
+/// of [`AdamConfig`](crate::AdamConfig), nor parameters are part of the state.
 ///
 /// ```
 /// use raygrad_autograd::{Gradient, Tensor};
@@ -35,7 +35,7 @@ pub struct OptimizerState<T: Scalar> {
     pub counts: BTreeMap<String, Vec<u64>>,
 }
 
-/// Why a state does not fit an optimiser and its parameters.
+/// The reason that a state does not fit an optimizer and its parameters.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
     /// The bytes are not a safetensors file.
@@ -45,9 +45,9 @@ pub enum StateError {
     /// An entry is missing, unknown or of another shape or type.
     #[error("`{name}` {what}")]
     Entry {
-        /// The entry.
+        /// The name of the entry.
         name: String,
-        /// What is wrong with it.
+        /// The mismatch.
         what: String,
     },
 }
@@ -58,7 +58,7 @@ impl StateError {
     }
 }
 
-/// The name of an entry; without a parameter it is one of the optimiser itself.
+/// The name of an entry. Without a parameter it is an entry of the optimizer itself.
 fn key(name: &str, what: &str) -> String {
     if name.is_empty() { what.to_owned() } else { format!("{name}.{what}") }
 }
@@ -74,12 +74,12 @@ impl<T: Scalar> OptimizerState<T> {
         self.counts.insert(key(name, what), counts);
     }
 
-    /// Whether there are such numbers of a parameter.
+    /// Whether a parameter has such numbers.
     pub(crate) fn has(&self, name: &str, what: &str) -> bool {
         self.tensors.contains_key(&key(name, what))
     }
 
-    /// Takes numbers of a parameter out.
+    /// Removes and returns numbers of a parameter.
     pub(crate) fn take(&mut self, name: &str, what: &str, shape: &[usize]) -> Result<Tensor<T>, StateError> {
         let key = key(name, what);
         let Some(tensor) = self.tensors.remove(&key) else { return Err(StateError::entry(&key, "is missing")) };
@@ -89,7 +89,7 @@ impl<T: Scalar> OptimizerState<T> {
         Ok(tensor)
     }
 
-    /// Takes counts of a parameter out, if there are any.
+    /// Removes and returns counts of a parameter, if there are any.
     pub(crate) fn take_counts(&mut self, name: &str, what: &str, len: usize) -> Result<Option<Vec<u64>>, StateError> {
         let key = key(name, what);
         match self.counts.remove(&key) {
@@ -100,18 +100,18 @@ impl<T: Scalar> OptimizerState<T> {
         }
     }
 
-    /// Takes the optimiser's own number of steps out.
+    /// Removes and returns the optimizer's own number of steps.
     pub(crate) fn take_steps(&mut self) -> Result<u64, StateError> {
         self.take_counts("", "steps", 1)?.map(|steps| steps[0]).ok_or_else(|| StateError::entry("steps", "is missing"))
     }
 
-    /// An error with these words if there are counts that a parameter cannot have.
+    /// An error with this text if a parameter has counts that it cannot have.
     pub(crate) fn refuse(&self, name: &str, what: &str, words: &str) -> Result<(), StateError> {
         let key = key(name, what);
         if self.counts.contains_key(&key) { Err(StateError::entry(&key, words)) } else { Ok(()) }
     }
 
-    /// An error if anything has not been taken out.
+    /// An error if an entry is left.
     pub(crate) fn refuse_rest(&self) -> Result<(), StateError> {
         let what = "is unknown: the state belongs to another optimiser or other parameters";
         self.tensors.keys().chain(self.counts.keys()).min().map_or(Ok(()), |name| Err(StateError::entry(name, what)))
@@ -120,10 +120,10 @@ impl<T: Scalar> OptimizerState<T> {
 
 #[cfg(feature = "files")]
 impl<T: Scalar> OptimizerState<T> {
-    /// The state as a safetensors file: tensors in their own type, counts as `U64`.
+    /// Serialises the state as a safetensors file: tensors in their own type, counts as `U64`.
     ///
     /// # Errors
-    /// If the format cannot hold it, as an entry that is among the tensors and among the counts.
+    /// If the format cannot hold it, such as an entry that is both a tensor and a count.
     pub fn to_safetensors(&self) -> Result<Vec<u8>, StateError> {
         if let Some(name) = bad_entry(self.tensors.keys().chain(self.counts.keys()).map(String::as_str)) {
             return Err(StateError::entry(name, "is there twice, or has a name of the format's own"));
@@ -136,11 +136,11 @@ impl<T: Scalar> OptimizerState<T> {
         Ok(safetensors::serialize(values.chain(counts), None)?)
     }
 
-    /// The state that such a file holds.
+    /// Reads a state from a safetensors file.
     ///
     /// # Errors
-    /// If the bytes are no safetensors file, a number type is neither that of the parameters nor `U64`, or a shape is of
-    /// a size that no memory holds.
+    /// If the bytes are not a safetensors file, or a number type is neither that of the parameters nor `U64`. Also if a
+    /// shape is larger than memory can hold.
     pub fn from_safetensors(bytes: &[u8]) -> Result<Self, StateError> {
         let mut state = OptimizerState { tensors: BTreeMap::new(), counts: BTreeMap::new() };
         for (name, view) in SafeTensors::deserialize(bytes)?.tensors() {

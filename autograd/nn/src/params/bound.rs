@@ -6,8 +6,8 @@ use raygrad_tensor::Scalar;
 use std::ops::Index;
 use std::sync::Arc;
 
-/// The names of a store's parameters and the handles that fit them, without values: it puts variables in the place of
-/// parameters, in a check of a whole model or inside a checkpoint. A clone is a reference count.
+/// The names and handles of a store, without values. It binds variables in place of parameters, to check a whole model
+/// or inside a checkpoint. Cloning copies a reference.
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor};
@@ -24,7 +24,7 @@ use std::sync::Arc;
 pub struct ParamLayout(pub(super) Arc<Names>);
 
 impl ParamLayout {
-    /// Variables in place of the parameters, in the order of the store.
+    /// Binds variables in place of the parameters, in the order of the store.
     ///
     /// # Panics
     /// If there is not one for each parameter.
@@ -40,23 +40,23 @@ impl ParamLayout {
 pub struct Bound<'t, T: Scalar> {
     pub(super) names: Arc<Names>,
     pub(super) vars: Vec<Var<'t, T>>,
-    /// None where nothing tells.
+    /// None if there are no parameters.
     pub(super) tape: Option<&'t Tape<T>>,
 }
 
 impl<'t, T: Scalar> Bound<'t, T> {
-    /// The parameters that gradients can be taken with respect to, in the order of the store: those that are not frozen.
+    /// The parameters that are not frozen, in the order of the store. Gradients can be taken with respect to these.
     pub fn vars(&self) -> Vec<&Var<'t, T>> {
         self.vars.iter().filter(|var| var.is_on_graph()).collect()
     }
 
-    /// The gradients of a one-element tensor, one for each parameter that is not frozen: what
-    /// [`Optimizer::update`](crate::Optimizer::update) takes.
+    /// The gradients of a one-element tensor, one for each parameter that is not frozen, for
+    /// [`Optimizer::update`](crate::Optimizer::update).
     ///
-    /// This is the end of a training step. The parameters are given up and everything that the tape has recorded is freed
-    /// with the values that it holds, so that an update moves the parameters where they are; a parameter that something
-    /// still holds is copied first. Values of variables can be read on, but not differentiated. Where more than this is
-    /// to be done with the graph, there is [`Var::backward`](raygrad_autograd::Var::backward) of [`vars`](Self::vars).
+    /// This ends a training step. It drops the bound parameters and frees the recorded operations with the values that
+    /// they hold. So an update changes the parameters in place; it copies a parameter first if other code still holds
+    /// it. Variables keep their values, but cannot be differentiated any more. To use the graph further, call
+    /// [`Var::backward`](raygrad_autograd::Var::backward) with [`vars`](Self::vars).
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -74,7 +74,7 @@ impl<'t, T: Scalar> Bound<'t, T> {
     /// ```
     ///
     /// # Panics
-    /// As [`Var::grad`](raygrad_autograd::Var::grad).
+    /// Where [`Var::grad`](raygrad_autograd::Var::grad) panics.
     #[track_caller]
     pub fn backward(self, loss: &Var<'t, T>) -> Vec<Gradient<T>> {
         let wanted = self.vars();
@@ -83,10 +83,10 @@ impl<'t, T: Scalar> Bound<'t, T> {
         grads
     }
 
-    /// The tape that the parameters are on.
+    /// The tape of the parameters.
     ///
     /// # Panics
-    /// If there is no parameter to tell, in what [`ParamLayout::bind`] gave.
+    /// If [`ParamLayout::bind`] made this without any variables.
     #[track_caller]
     pub fn tape(&self) -> &'t Tape<T> {
         self.tape.unwrap_or_else(|| panic!("the tape of no parameters"))
@@ -99,7 +99,7 @@ impl<'t, T: Scalar> Index<ParamId> for Bound<'t, T> {
     /// The parameter of a handle.
     ///
     /// # Panics
-    /// If the handle is that of another store.
+    /// If the handle belongs to another store.
     #[track_caller]
     fn index(&self, id: ParamId) -> &Var<'t, T> {
         &self.vars[self.names.place(id)]
