@@ -1,9 +1,9 @@
-//! A guide: from a first gradient to a custom operation and a trained model.
+//! A guide from a first gradient to a custom operation and a trained model.
 //!
 //! # A gradient
 //!
-//! A [`Tape`](crate::Tape) writes down what is done with its variables, and a gradient reads that backwards. A *leaf* is
-//! what gradients are taken by; a *constant* is not. Arithmetic broadcasts as in NumPy.
+//! A [`Tape`](crate::Tape) records operations on its variables, and a gradient runs through the record backwards. A
+//! *leaf* is a variable to differentiate by; a *constant* has no gradient. Arithmetic broadcasts as in NumPy.
 //!
 //! ```
 //! use raygrad::{Tape, Tensor};
@@ -14,14 +14,14 @@
 //! assert_eq!(y.grad(&[&x])[0], [1.0, 2.0, 3.0]);
 //! ```
 //!
-//! Tapes share no state: any number of them run on any threads, and a tape's memory goes with it. An operation on large
-//! tensors uses all of rayon's threads (`RAYON_NUM_THREADS` sets how many), or those of the caller's own pool in
-//! `ThreadPool::install`; inside [`parallel::serial`](crate::tensor::parallel::serial) it keeps to its thread.
+//! Tapes share no state: any number of them run on any threads, and dropping a tape frees its memory. An operation on
+//! large tensors uses all of rayon's threads (`RAYON_NUM_THREADS` sets their number), or those of the caller's pool in
+//! `ThreadPool::install`. Inside [`parallel::serial`](crate::tensor::parallel::serial) it stays on its thread.
 //!
 //! # Gradients of gradients
 //!
-//! [`Var::grad_graph`](crate::Var::grad_graph) puts the gradient itself on the tape, so that it can be part of a loss or
-//! be differentiated again.
+//! [`Var::grad_graph`](crate::Var::grad_graph) puts the gradient itself on the tape. So it can be part of a loss, or be
+//! differentiated again.
 //!
 //! ```
 //! use raygrad::{Tape, Tensor};
@@ -33,8 +33,8 @@
 //! assert_eq!(penalty.grad(&[&x])[0].item(), 192.0); // 2 (4 x^3 - 30) 12 x^2
 //! ```
 //!
-//! For a function rather than a graph, [`derivatives`](crate::derivatives) has what is usually wanted: value and
-//! gradient, products with the Jacobian from either side, Jacobian, Hessian and products with it.
+//! To differentiate a function rather than a graph, use [`derivatives`](crate::derivatives). It has value and gradient,
+//! Jacobian, Hessian, and products with them.
 //!
 //! ```
 //! use raygrad::{Tensor, derivatives::hvp};
@@ -44,12 +44,15 @@
 //! assert_eq!(product[0], [18.0, 0.0]);
 //! ```
 //!
-//! # What goes wrong, and how one hears of it
+//! # Errors
 //!
-//! A wrong shape says which operation, which shapes and where it was called, as a panic. Where it should be an error
-//! instead, [`Tape::try_run`](crate::Tape::try_run) runs any code out of ordinary methods and operators and gives the first
-//! error, [`Tape::try_apply`](crate::Tape::try_apply) runs a single operation, and every kind of gradient has a form that
-//! begins with `try_`.
+//! An operation with wrong shapes panics. The message names the operation, the shapes and the line of the call. There
+//! are three ways to get an error instead:
+//!
+//! * [`Tape::try_run`](crate::Tape::try_run) runs any code with plain methods and operators, and returns the first
+//!   error;
+//! * [`Tape::try_apply`](crate::Tape::try_apply) runs a single operation;
+//! * every kind of gradient has a form that begins with `try_`.
 //!
 //! ```
 //! use raygrad::{Error, Tape, Tensor};
@@ -59,11 +62,13 @@
 //! assert!(matches!(loss, Err(Error::Shape { op: "matmul", .. })));
 //! ```
 //!
-//! A gradient of a constant, or with respect to one, is such an error too, and never a zero: what was computed in
-//! [`Tape::no_grad`](crate::Tape::no_grad) has none. Code that takes a gradient as a part of what it computes, as a force is
-//! the gradient of an energy, says so with [`Tape::enable_grad`](crate::Tape::enable_grad). The NaN finder names the operation, the line and the index
-//! of the first number that is not finite, forwards or backwards. What operations give at kinks, ties and the edges of
-//! their domains is one table: [`conventions`](crate::conventions).
+//! A gradient of a constant, or with respect to one, is such an error too, and never a zero. Results computed in
+//! [`Tape::no_grad`](crate::Tape::no_grad) are constants. Code that takes a gradient inside a computation, such as a
+//! force that is the gradient of an energy, uses [`Tape::enable_grad`](crate::Tape::enable_grad).
+//!
+//! [`Tape::check_finite`](crate::Tape::check_finite) reports the first number that is infinite or NaN, in the forward
+//! or backward pass. The error names the operation, the line and the index. The table of
+//! [`conventions`](crate::conventions) lists values and gradients at kinks, ties and the edges of domains.
 //!
 //! ```
 //! use raygrad::{Tape, Tensor};
@@ -76,10 +81,10 @@
 //!
 //! # A custom operation
 //!
-//! A chain of elementwise operations passes over memory once for each of them, and once more for each gradient. Written
-//! as a [`formula!`](crate::formula), it is one pass forward, without arrays in between, and one backward for the
-//! gradients of all operands. Nothing else is to be written: the gradients follow from the formula, which is read for
-//! [`Dual`](crate::Dual) numbers, and higher derivatives too.
+//! A chain of elementwise operations passes over memory once for each operation, and once more for each gradient. A
+//! [`formula!`](crate::formula) takes one forward pass, without temporary arrays, and one backward pass for the
+//! gradients of all operands. Gradients follow from the formula, which runs on [`Dual`](crate::Dual) numbers; so do
+//! higher derivatives.
 //!
 //! ```
 //! use raygrad::{Tape, Tensor, formula};
@@ -92,8 +97,8 @@
 //! assert_eq!(grads[1], [-((-1.0_f64).exp() + 3.0_f64.exp()), -3.0_f64.exp()]); // 3.5 is beyond the limit
 //! ```
 //!
-//! An operation with a name is a [`Formula`](crate::Formula): a function written once for every kind of number. Its
-//! derivative can be written too, where another form has more digits or is faster.
+//! An operation with a name is a [`Formula`](crate::Formula): a function that is generic over the number type. It can
+//! define its derivative too, if another form is more accurate or faster.
 //!
 //! ```
 //! use raygrad::check::{Cases, Check, Entry, check_op};
@@ -128,20 +133,24 @@
 //! assert!(report.first_order < 1e-9 && report.second_order < 1e-9);
 //! ```
 //!
-//! With the feature `check`, [`check_op`](crate::autograd::check::check_op) runs the checks that every operation of this
-//! crate passes: finite differences of first and second order, dual numbers, f32 against f64, extremes, inputs of any
-//! origin, the same bits twice. They find a wrong sign, a forgotten factor or a missing sum. An operation that is not
-//! elementwise is an [`Op`](crate::Op), whose derivative is written with variables. An operation may be *fused*: then it carries a `reference` made of plain
-//! operations, which is its oracle and its second derivative. A function that is made of operations needs no derivative
-//! at all, and [`check_function`](crate::autograd::check::check_function) checks what it uses.
+//! With the feature `check`, [`check_op`](crate::autograd::check::check_op) runs the checks that every operation of
+//! this crate passes. They include finite differences of first and second order, dual numbers, f32 against f64, exact
+//! values, views and repeated runs. They find a wrong sign, a forgotten factor or a missing sum.
+//!
+//! An operation that is not elementwise is an [`Op`](crate::Op), whose derivative is written with variables. An
+//! operation may be *fused*: then it has a `reference` made of plain operations, for its tests and its second
+//! derivative. A function made of operations needs no derivative.
+//! [`check_function`](crate::autograd::check::check_function) checks it.
 //!
 //! # A model that learns
 //!
-//! Parameters live in a store, [`Params`](crate::Params), outside of any tape. A layer is a handle on some of them and a
-//! function of (parameters, input). A training step binds the store to a fresh tape, takes the gradient of a loss, and
-//! hands it to an optimiser. [`Bound::backward`](crate::Bound::backward) gives up the bound parameters and frees what the
-//! tape holds, so that the optimiser moves them in place, without a copy. What an update did has to be looked at: elements
-//! whose gradient is infinite or NaN stay where they are, and `check` is an error if there are any.
+//! Parameters are stored in [`Params`](crate::Params), outside any tape. A layer has handles of some of them and is a
+//! function of parameters and input. A training step binds the parameters to a fresh tape, takes the gradient of a
+//! loss, and passes it to an optimizer.
+//!
+//! [`Bound::backward`](crate::Bound::backward) drops the bound parameters and frees the tape's values, so that the
+//! optimizer updates the parameters in place. An update skips elements whose gradient is infinite or NaN. Call `check`
+//! on its report: it is an error if elements were skipped.
 //!
 //! ```
 //! use rand::SeedableRng;
@@ -171,9 +180,11 @@
 //! assert!(last < 2e-3, "{last}");
 //! ```
 //!
-//! `backward` frees what it has used as it goes; a tape made with [`Tape::with_pool`](crate::Tape::with_pool) gets its
-//! buffers from the last step, so that a running loop allocates nothing of tensor size. A large model's activations
-//! need not all be kept: [`Tape::checkpoint`](crate::Tape::checkpoint) computes a part again when its gradient is due.
-//! [`Params`](crate::Params) reads and writes safetensors and NumPy's npz, and chooses by name which parameters are frozen,
-//! have a learning rate or a weight decay of their own, or are tables of which only the rows with a gradient are moved.
-//! [`Optimizer::state`](crate::Optimizer::state) is what a run needs besides to go on later, bit for bit.
+//! `backward` frees values after their last use. A tape made with [`Tape::with_pool`](crate::Tape::with_pool) reuses
+//! the buffers of the last step, so that a loop allocates no tensor-sized memory.
+//! [`Tape::checkpoint`](crate::Tape::checkpoint) saves memory in large models: it computes activations again in the
+//! backward pass.
+//!
+//! [`Params`](crate::Params) reads and writes safetensors and NumPy's npz. It selects by name the parameters that are
+//! frozen, that have their own learning rate or weight decay, or that are tables updated by row.
+//! [`Optimizer::state`](crate::Optimizer::state) is the rest of a checkpoint, to resume a run bit for bit.

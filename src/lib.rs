@@ -1,16 +1,24 @@
-//! Automatic differentiation over ndarray tensors, and NeRF on top of it: photographs and camera poses go in, new views
-//! come out. On a CPU.
+//! Automatic differentiation of ndarray tensors on a CPU, and neural radiance fields (NeRF) on top of it.
 //!
-//! What a model is made of stands at the top: [`Tensor`], [`Tape`], [`Var`], [`Params`], layers, optimisers. It comes from
-//! the crates
+//! Start with [`guide`], which leads from a first gradient to a custom operation and a trained model. In short:
+//!
+//! ```
+//! use raygrad::{Tape, Tensor};
+//! let tape = Tape::<f32>::new();
+//! let x = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0]]));
+//! let loss = (x.matmul(&x.t()) * 0.5).sum();
+//! assert_eq!(loss.item(), 26.0);
+//! assert_eq!(loss.grad(&[&x])[0], [[4.0, 6.0], [4.0, 6.0]]); // the sums of the columns
+//! ```
+//!
+//! The parts of a model are at the top level: [`Tensor`], [`Tape`], [`Var`], [`Params`], layers, optimizers. They come
+//! from these crates:
 //! * [`tensor`]: arrays and kernels;
 //! * [`autograd`]: the tape, operations, gradient checks;
-//! * [`nn`]: parameters, layers, optimisers and their files;
+//! * [`nn`]: parameters, layers, optimizers and their files.
 //!
-//! and, with the feature `nerf` (on by default), from
+//! The feature `nerf` (on by default) adds one more:
 //! * [`nerf`](https://docs.rs/raygrad-nerf): cameras, datasets, encodings, fields, sampling, rendering, training.
-//!
-//! [`guide`] leads from a first gradient to a custom operation and a trained model.
 
 pub mod guide;
 
