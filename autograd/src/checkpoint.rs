@@ -43,7 +43,7 @@ where
         let first = |i: usize| (0..i).find(|&j| cx.edges[j] == cx.edges[i] && cx.needs(j)).unwrap_or(i);
         let mut x: Vec<Var<'_, T>> = Vec::with_capacity(cx.len());
         for i in 0..cx.len() {
-            // Those whose gradient nobody needs are leaves too: `f` may take gradients with respect to them.
+            // Inputs whose gradient is not needed are leaves too: `f` may take gradients with respect to them.
             x.push(match cx.needs(i) && first(i) < i {
                 true => x[first(i)].clone(),
                 false => tape.unchecked_leaf(cx.input(i).clone(), at),

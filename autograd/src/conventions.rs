@@ -120,7 +120,7 @@
 mod tests {
     use crate::{Scalar, Tape, Tensor, Var};
 
-    /// The operation that a row of the table names.
+    /// The operation of a row of the table.
     fn apply<'t, T: Scalar>(operation: &str, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         let (a, b, c) = (&x[0], x.get(1).unwrap_or(&x[0]), x.get(2).unwrap_or(&x[0]));
         Some(match operation {
@@ -211,7 +211,7 @@ mod tests {
         let x: Vec<_> = tensors(row[1]).into_iter().map(|x| tape.leaf(x)).collect();
         let wrt: Vec<_> = x.iter().collect();
         let y = apply(row[0], &x).ok_or_else(|| format!("{} is not among the operations of the test", row[0]))?;
-        // What is constant in its inputs, as a comparison, has the gradient 0 here.
+        // An operation that is constant in its inputs, such as a comparison, has gradient 0 here.
         let sum = y.sum().tracked();
         let recorded: Vec<_> = sum.grad_graph(&wrt).into_iter().map(Var::into_value).collect();
         let (grads, y) = (sum.grad(&wrt), [y.into_value()]);

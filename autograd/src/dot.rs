@@ -81,7 +81,7 @@ mod tests {
         }
         assert!(dot.starts_with("digraph tape {\n") && dot.ends_with("}\n"));
         assert_eq!(dot.matches("->").count(), 4);
-        // Recorded gradients carry the line of what they are the gradient of.
+        // A recorded gradient has the line of the operation that it is the gradient of.
         let before = tape.len();
         loss.grad_graph(&[&w]);
         let dot = tape.to_dot();

@@ -239,7 +239,7 @@ fn gradients<'t, T: Scalar, const N: usize>(
     }
     let mut grads = [const { None }; N];
     if wanted.contains(&true) {
-        // What no wanted gradient reads costs a register, not a pass over memory: `g` stands in for it.
+        // An operand that no wanted gradient reads takes a register, not a pass over memory: `g` replaces it.
         let mut x: SmallVec<[&Tensor<T>; 6]> = SmallVec::new();
         x.push(g);
         x.push(if reads & Reading::OUTPUT == 0 { g } else { cx.output() });

@@ -6,8 +6,8 @@ use std::any::Any;
 use std::fmt;
 use std::sync::Arc;
 
-/// A sparse contribution to a gradient. For a table of which few rows were used (an embedding, a hash grid), it is much
-/// smaller than the table.
+/// A sparse contribution to a gradient. For a table with few used rows (an embedding, a hash grid), it is much smaller
+/// than the table.
 ///
 /// An operation returns one with [`Grads::with_sparse`](crate::Grads::with_sparse). It reaches an optimizer unchanged,
 /// in a [`Gradient`]. [`Gradient::into_dense`] adds it to a dense tensor.

@@ -96,7 +96,7 @@ mod tests {
         assert_eq!(y.grad(&[&x])[0].as_slice(), expected);
         assert_eq!(y.grad_graph(&[&x])[0].value().as_slice(), expected);
         assert_eq!(*seen.lock().unwrap(), [expected.clone(), expected]);
-        // Nobody asks for what lies behind the hook: it is not called.
+        // No wanted gradient is behind the hook, so it is not called.
         assert_eq!(y.grad(&[&h])[0].as_slice(), [12.0, 14.0]);
         let constant = tape.constant(Tensor::scalar(1.0)).inspect_grad(|_| panic!("a constant has no gradient"));
         assert!(!constant.is_on_graph());

@@ -51,7 +51,7 @@ impl<T: Scalar> Tape<T> {
     pub fn cache_outputs<R>(&self, f: impl FnOnce() -> R) -> (R, Memo<T>) {
         let (result, values) = with_cell(&self.remembered, Some(vec![]), f);
         let values = values.unwrap_or_default();
-        // Who remembers around it remembers this too.
+        // An enclosing `cache_outputs` saves these outputs too.
         values.iter().for_each(|value| self.keep(value));
         (result, Memo { values })
     }
@@ -127,7 +127,7 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
-    /// y = 2 x, and how often it was worked out.
+    /// y = 2 x, with a count of its runs.
     struct Twice(Arc<AtomicUsize>);
 
     impl<T: Scalar> Op<T> for Twice {

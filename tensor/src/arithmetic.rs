@@ -209,7 +209,7 @@ impl<T: Scalar> Tensor<T> {
         // A transpose is brought into order tile by tile first.
         let turned = other.layout().rows_in_memory().is_some() && !other.layout().strides().contains(&0);
         if other.is_packed() || turned {
-            // A view of its own: what is packed for this goes with it.
+            // A separate view: its packed copy is dropped with it.
             let other = other.with_layout(other.layout().clone());
             let b = other.as_slice();
             chunks(self.as_mut_slice(), STRETCH, work, || (), &|(), i, a| stretch(a, &b[i * STRETCH..][..a.len()]));

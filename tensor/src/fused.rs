@@ -210,7 +210,7 @@ pub fn lanes_fused<T: Scalar, const QUICK: bool, const K: usize, const N: usize,
     assert!(x.len() == K + N && out.len() == M, "{} operands and {} results of a formula", x.len(), out.len());
     let n = out.first().map_or(0, |out| out.len());
     if M > 1 && n == 1 {
-        // Numbers do without what holds the results of a stretch.
+        // Single numbers do not need the buffer for the results of a stretch.
         let (first, second) = (cut::<T, K>(x, 0, 1), cut::<T, N>(x, K, 1));
         let results = f(gather(&first, 0), gather(&second, 0));
         let mut outside = T::Flags::default();

@@ -196,7 +196,7 @@ pub fn matmul<T: Scalar>(a: &Tensor<T>, b: &Tensor<T>, pool: &Pool<T>) -> Tensor
 #[derive(Clone, Copy)]
 struct Target<T>(*mut T);
 
-// SAFETY: a place to write to from several threads; who calls `at` sees to it that no two write to one element.
+// SAFETY: a place to write to from several threads; callers of `at` ensure that no two write to one element.
 unsafe impl<T: Send> Sync for Target<T> {}
 
 impl<T> Target<T> {

@@ -92,7 +92,7 @@ impl<T: Scalar> Tensor<T> {
         let (x, middle) = match axes.run() {
             Some((first, behind)) => {
                 let extent = |axes: Range<usize>| self.shape()[axes].iter().product();
-                // A view of its own: what is packed for this goes with it.
+                // A separate view: its packed copy is dropped with it.
                 (
                     self.with_layout(self.layout().clone()),
                     [extent(0..first), extent(first..behind), extent(behind..self.ndim())],

@@ -205,8 +205,8 @@ impl<T: Scalar> Tensor<T> {
         if let Some(packed) = view.packed.get() {
             return &packed.values;
         }
-        // Not while others wait for it: a thread that waits for its helpers may take up one of them. Who comes second throws
-        // its copy away.
+        // The copy is made before `get_or_init`, where other threads would wait for it: a thread that waits for its
+        // helpers may start a task that waits here. The second of two threads drops its copy.
         let pool = self.pool();
         let mut values = pool.take(self.len());
         view.layout.read(self.buffer(), &mut values);
@@ -235,7 +235,7 @@ impl<T: Scalar> Tensor<T> {
             return;
         }
         let (layout, pool) = (self.layout(), self.pool());
-        // A packed copy that nobody else sees can be taken.
+        // A packed copy that no other tensor uses can be taken.
         let packed = self.view.take().and_then(|mut view| Arc::get_mut(&mut view).and_then(|view| view.packed.take()));
         let buffer = packed.unwrap_or_else(|| {
             let mut values = pool.take(layout.len());
@@ -293,7 +293,7 @@ impl<T: Scalar> Tensor<T> {
 
     /// Converts the elements to another number type, rounded to nearest.
     pub fn cast<U: Scalar>(&self) -> Tensor<U> {
-        // A view stays one: what it repeats is converted once.
+        // A view stays a view: repeated elements are converted once.
         let values = self.buffer().iter().map(|&x| U::from_f64(x.to_f64())).collect();
         match &self.view {
             None => Tensor::from_vec(&self.shape, values),

@@ -264,7 +264,7 @@ impl Layout {
             for rows in starts(0..height, BLOCK) {
                 for columns in starts(0..lead, COLUMNS).chain(starts(lead..width, COLUMNS)) {
                     if large {
-                        // What the next block reads, while this one is written.
+                        // Prefetch the next block while this one is written.
                         for column in columns.end..width.min(columns.end + COLUMNS) {
                             let line = (from + column as isize * step) as usize;
                             rows.clone().step_by(LINE / size_of::<T>()).for_each(|row| prefetch(&source[line + row]));

@@ -30,7 +30,7 @@ pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
 /// The first name that cannot be an entry of a safetensors file, if any.
 pub(crate) fn bad_entry<'a>(names: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let mut seen = HashSet::new();
-    // What the format calls its metadata.
+    // The format's name for its metadata.
     names.into_iter().find(|name| *name == "__metadata__" || !seen.insert(*name))
 }
 

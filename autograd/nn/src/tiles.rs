@@ -196,7 +196,7 @@ impl<T: Scalar> Slot<T> {
         let grads = if bound.vars().is_empty() { vec![] } else { loss.tracked().backward(&bound.vars()) };
         for (((is_set, sum), shares), mut grad) in self.sums.iter_mut().zip(&mut self.shares).zip(grads) {
             shares.extend(grad.take_sparse().into_iter().map(|share| (tile, share)));
-            // What the tile did not reach has no share and rests.
+            // A parameter that the tile does not use has no gradient.
             if grad.is_zero() {
                 continue;
             }

@@ -124,7 +124,7 @@ fn against_differences(
     f: &dyn Fn(&[Tensor<f64>]) -> [f64; 2],
 ) -> Result<(f64, usize), String> {
     let (mut worst, mut count) = (0.0_f64, 0);
-    // What rounding makes of a difference, as a scale: the tolerance times this is let pass.
+    // The effect of rounding on a difference, as a scale: the tolerance times this is accepted.
     let rounding = ROUNDINGS * f64::EPSILON * f(x)[1] / (check.step * check.tolerance);
     for (which, grad) in grads.iter().enumerate() {
         let norm = norm(grad);

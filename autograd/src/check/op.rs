@@ -90,7 +90,7 @@ fn check_sample(check: &Check, entry: &Entry, x: &[Tensor<f64>]) -> Result<Repor
         // The values of one of the two, those that lie in the domain of both.
         let values = if evaluates(&entry.f64, x, i, j) { i } else { j };
         let [shared, apart] = [true, false].map(|shared| twice(&entry.f64, x, [i, j], values, shared));
-        // Two derivatives may cancel: what rounding leaves is no error.
+        // Two derivatives may cancel: their rounding errors are accepted.
         compare_all(&what, &shared, &apart, 1e-12, 1e-3)?;
         report.comparisons += 1;
     }
@@ -355,7 +355,7 @@ fn extreme_case<T: Scalar>(op: &Arc<dyn Op<T>>, extreme: &super::Extreme, tolera
     let y = tape.apply(op.clone(), &wrt);
     let grads = y.grad(&wrt);
     let same = |what: &str, got: T, expected: f64| {
-        // The expectation as this type holds it: what overflows or underflows there is to do so.
+        // The expected value in this type, where it may overflow or underflow.
         let expected = T::from_f64(expected).to_f64();
         if expected.is_nan() && got.to_f64().is_nan() {
             return Ok(0.0);

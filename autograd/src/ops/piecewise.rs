@@ -75,9 +75,9 @@ pub(crate) fn share<E: Real>(g: E, lead: E) -> E {
 /// y = x limited to low..=high, NaN for NaN; dx = g inside and on the limits, 0 beyond.
 #[derive(Clone, Copy)]
 pub struct Clamp {
-    /// The least value.
+    /// The lower limit.
     pub low: f64,
-    /// The greatest value.
+    /// The upper limit.
     pub high: f64,
 }
 impl Formula<1> for Clamp {
@@ -100,7 +100,7 @@ impl Formula<1> for Clamp {
     }
 }
 
-/// y = the greatest whole number that is not above x; dx = 0.
+/// y = the largest whole number that is not above x; dx = 0.
 #[derive(Clone, Copy)]
 pub struct Floor;
 impl Formula<1> for Floor {
@@ -114,7 +114,7 @@ impl Formula<1> for Floor {
     }
 }
 
-/// y = the least whole number that is not below x; dx = 0.
+/// y = the smallest whole number that is not below x; dx = 0.
 #[derive(Clone, Copy)]
 pub struct Ceil;
 impl Formula<1> for Ceil {
@@ -128,7 +128,7 @@ impl Formula<1> for Ceil {
     }
 }
 
-/// y = the whole number nearest to x, the even one of two; dx = 0.
+/// y = the whole number nearest to x; ties go to the even one; dx = 0.
 #[derive(Clone, Copy)]
 pub struct Round;
 impl Formula<1> for Round {

@@ -1,4 +1,4 @@
-//! The sparse gradient of a table of which some rows were used.
+//! The sparse gradient of a table with few used rows.
 
 use super::pick::check_index;
 use crate::{RowShare, RowSums, SparseGrad};
@@ -34,7 +34,7 @@ pub(super) fn add_rows<T: Scalar>(dense: &mut [T], rows: &[T], index: &[u32], wi
     }
 }
 
-/// The sparse gradient of a table of which some rows were gathered: rows of the output's gradient, and their indices.
+/// The sparse gradient of a table, as from [`Var::gather_rows`](crate::Var::gather_rows): rows and their indices.
 #[derive(Debug, Clone)]
 pub struct RowGrad<T: Scalar> {
     shape: Shape,

@@ -75,7 +75,7 @@ impl<T: Scalar> Op<T> for View {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        // What shows every element once leads back without a copy.
+        // A view of every element once is inverted without a copy.
         if let Some(layout) = self.layout.inverted() {
             let back = View { from: Shape::from_slice(self.layout.shape()), layout };
             return Grads::one(cx.tape().apply(back, &[cx.g()]).reshape(cx.shape(0)));

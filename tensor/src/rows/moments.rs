@@ -113,7 +113,7 @@ pub fn layer_norm_rows_grad<T: Scalar>(
     assert!(fits, "sums of other lengths than gain and bias, {n}");
     let wanted = if sums.is_some() { 2 * n } else { 0 };
     if !x.is_empty() {
-        // Of whole groups, so that what is added to what depends on the sizes alone.
+        // Parts of whole groups, so that the order of sums depends on the sizes alone.
         let len = n * (x.len() / n).div_ceil(PARTS).max(4 * GROUP).next_multiple_of(GROUP);
         let mut parts: Vec<_> = dx[..x.len()].chunks_mut(len).map(|dx| (dx, vec![0.0_f64; wanted])).collect();
         chunks(

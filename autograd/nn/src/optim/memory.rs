@@ -193,7 +193,7 @@ impl<T: Scalar> Slot<T> {
         let ([rows, features], name) = (part.table(), part.name);
         let (shares, parts) = part.row_parts();
         let (in_parts, sizes) = (parts.is_some(), parts.unwrap_or_else(|| vec![rows]));
-        // They come back empty, or not at all: what a panic leaves in them is not for the next step.
+        // They are put back empty, or not at all: after a panic, the next step must not use them.
         let mut sums = std::mem::take(&mut self.sums);
         if !sums.iter().map(RowSums::table_rows).eq(sizes.iter().copied()) {
             sums = sizes.iter().map(|&rows| RowSums::new(rows, features)).collect();
@@ -214,15 +214,15 @@ impl<T: Scalar> Slot<T> {
             if let Some(dense) = &dense {
                 dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
             }
-            // A share of somebody else's could have put others in their place, of rows that reach into the next part.
+            // A user's `RowShare` could have replaced the sums, with rows that reach into the next part.
             let size = [sums.table_rows(), sums.features()];
             assert_eq!(size, [sizes[part], features], "rows and features of part {part} of `{name}`");
             let first = sizes[..part].iter().sum();
             parallel::each_of(sums.rows().chunks(ROWS).zip(sums.sums().chunks(ROWS * features)), |_, (rows, sums)| {
                 let moved = simd::dispatch(
                     #[inline(always)]
-                    // SAFETY: `RowSums` has each row once and below the number of its rows, which was checked after anybody
-                    // else could change it, and the rows of one part end where those of the next begin: so no other task
+                    // SAFETY: `RowSums` has each row once and below the number of its rows, which was checked after the
+                    // last call of other code. The rows of one part end where those of the next begin: so no other task
                     // and no other turn of its loop has them. `tasks_share_a_table` and `parts_share_a_table` run it.
                     || unsafe { table.move_rows(first, rows, sums, &rule) },
                 );

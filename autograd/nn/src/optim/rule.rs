@@ -64,7 +64,7 @@ fn move_piece<T: Scalar, const M: usize, const W: usize>(
     rule: &impl Rule<T, M>,
 ) -> usize {
     let features = x.len();
-    // Copies cannot overlap what is written meanwhile, so that the loop vectorises.
+    // Copies cannot overlap the slices that are written, so that the loop vectorises.
     let (mut values, mut g, mut kept, mut skipped) = ([T::ZERO; W], [T::ZERO; W], [[T::ZERO; W]; M], 0);
     values.copy_from_slice(&x[at..at + W]);
     g.copy_from_slice(&grad[at..at + W]);
@@ -209,7 +209,7 @@ impl<'a, T> Shared<'a, T> {
     // SAFETY: kept by the callers, whose elements are all different.
     unsafe fn get(&self, start: usize, len: usize) -> &mut [T] {
         assert!(start <= self.len && len <= self.len - start, "elements beyond the table");
-        // SAFETY: the range lies within the slice that `new` borrowed, and the caller vouches that nobody else holds it.
+        // SAFETY: the range lies within the slice that `new` borrowed, and the caller ensures that no other borrow exists.
         unsafe { std::slice::from_raw_parts_mut(self.first.add(start), len) }
     }
 

@@ -31,7 +31,7 @@ use std::collections::BTreeMap;
 pub struct OptimizerState<T: Scalar> {
     /// Numbers of the parameters' type: moments, velocities, averages.
     pub tensors: BTreeMap<String, Tensor<T>>,
-    /// Counts of steps: of the optimiser, of a parameter, or of each row of a table.
+    /// Counts of steps: of the optimizer, of a parameter, or of each row of a table.
     pub counts: BTreeMap<String, Vec<u64>>,
 }
 
