@@ -27,7 +27,8 @@ pub trait SparseGrad<T: Scalar>: Any + Send + Sync {
     /// Whether the backward pass adds this contribution to a dense gradient on arrival. The default keeps it sparse
     /// until the end.
     ///
-    /// The gradient of a slice does this: most of it is zero, and many slices of one tensor then share one dense sum.
+    /// The gradient of a slice is added on arrival: most of it is zero, and many slices of one tensor then share one
+    /// dense sum.
     fn is_passing(&self) -> bool {
         false
     }

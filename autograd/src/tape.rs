@@ -154,8 +154,8 @@ impl<T: Scalar> Tape<T> {
 
     /// Runs `f` without recording: its results are constants (`torch.no_grad`).
     ///
-    /// The gradient of such a constant is an error. Code that takes a gradient inside a computation should record it
-    /// with [`enable_grad`](Self::enable_grad), as the force that is the gradient of an energy.
+    /// The gradient of such a constant is an error. Code that takes a gradient inside a computation, such as a force
+    /// from an energy, records it with [`enable_grad`](Self::enable_grad).
     pub fn no_grad<R>(&self, f: impl FnOnce() -> R) -> R {
         self.with_recording(false, f)
     }

@@ -1,8 +1,8 @@
-//! Parallel loops on rayon's threads, with the same bits for any number of threads.
+//! Parallel loops on rayon's threads, with the same bits for any number of threads. Start with [`each`] and [`chunks`].
 //!
 //! The sizes alone determine how an operation on a large tensor is split, and so the order of sums. The threads of the
-//! caller's rayon pool work on the parts. A caller that already runs in parallel wraps its operations in [`serial`]:
-//! they run faster without waiting for other threads.
+//! caller's rayon pool work on the parts. A caller that already runs in parallel should wrap its operations in
+//! [`serial`], since waiting for other threads would delay it.
 
 use rayon::prelude::*;
 use std::cell::Cell;

@@ -1,4 +1,5 @@
-//! Tensors of random numbers, from any generator of the crate `rand`.
+//! Tensors of random numbers, from any generator of the crate `rand`. Start with [`Tensor::rand`] and
+//! [`Tensor::randn`].
 
 use crate::{Indices, Scalar, Tensor};
 use rand::{Rng, RngExt};

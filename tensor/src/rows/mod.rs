@@ -1,4 +1,5 @@
-//! Kernels on the rows of a matrix: softmax, log-softmax, log-sum-exp, cross-entropy, layer normalisation.
+//! Kernels on the rows of a matrix: softmax, log-softmax, log-sum-exp, cross-entropy, layer normalisation. Start with
+//! [`softmax_rows`].
 //!
 //! A matrix is processed in blocks of whole rows that fit in a core's nearest cache. Elementwise parts (an exponential)
 //! run over the whole block, so that rows shorter than a register are as fast as long ones.

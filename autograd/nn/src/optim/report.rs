@@ -5,8 +5,8 @@ use std::fmt;
 /// The result of [`Optimizer::update`](crate::Optimizer::update), in elements of parameters.
 ///
 /// An optimizer skips an element whose gradient is infinite or NaN. So a run survives a single overflow, but a diverged
-/// run would stop silently. Look at the report in each step: [`check`](Self::check) fails at the first skipped element.
-/// A run that should tolerate some can test [`has_only_non_finite`](Self::has_only_non_finite) over many steps.
+/// run would stop silently. Look at the report in each step: [`check`](Self::check) fails if an element was skipped. A
+/// run that should tolerate some can test [`has_only_non_finite`](Self::has_only_non_finite) over many steps.
 #[must_use = "elements whose gradient is infinite or NaN stay where they are: `check` says whether there are any"]
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct UpdateReport {
@@ -36,8 +36,8 @@ impl UpdateReport {
         if self.skipped == 0 { Ok(self.moved) } else { Err(NonFinite(self)) }
     }
 
-    /// Whether all gradients were infinite or NaN, and there were some. One such step is an overflow; if it is every
-    /// step, the run has diverged.
+    /// Whether every element with a gradient was skipped, and there were some. One such step may be an overflow. If
+    /// every step is like this, the run has diverged.
     pub fn has_only_non_finite(&self) -> bool {
         self.moved == 0 && self.skipped > 0
     }
