@@ -49,11 +49,11 @@ pub(crate) fn is_worthwhile(work: usize) -> bool {
     work >= WORTHWHILE && !SERIAL.get() && rayon::current_num_threads() > 1
 }
 
-/// Calls `f(i)` for every `i` below `count`, on all threads of the caller's rayon pool. Operations inside `f` stay on
-/// their thread.
+/// Calls `f(i)` for every `i` below `count`, on all threads of the caller's rayon pool, or within [`serial`] on this
+/// thread.
 ///
-/// All parallel loops use this one, and it calls `f` through a pointer, so that rayon is compiled once and not for each
-/// loop.
+/// Operations inside `f` stay on their thread; a single call may use all threads itself. Loops call `f` through a
+/// pointer, so that rayon is compiled once and not for each loop.
 #[inline(never)]
 pub fn each(count: usize, f: &(dyn Fn(usize) + Sync)) {
     match count {

@@ -27,7 +27,15 @@ fn variance<T: Scalar>(x: &Tensor<T>, shape: &[usize], correction: f64, pool: &P
         variance_rows(x.as_slice(), n, out.as_mut_slice());
     } else {
         // As `variance_rows`: deviations from the rounded mean, corrected for its rounding.
-        let mean_of = |x: &Tensor<T>| sum_to(x, shape, pool) * T::from_f64(1.0 / count);
+        let count = T::from_f64(count);
+        let mean_of = |x: &Tensor<T>| {
+            map(
+                [&sum_to(x, shape, pool)],
+                pool,
+                #[inline(always)]
+                |[sum]| sum / count,
+            )
+        };
         let deviation = map(
             [x, &mean_of(x)],
             pool,

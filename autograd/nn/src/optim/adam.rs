@@ -77,9 +77,7 @@ impl AdamConfig {
 struct Group<T> {
     config: AdamConfig,
     decay: f64,
-    /// For each step of a row, from 1 on, the bias corrections of learning rate and epsilon:
-    /// `sqrt(1 - beta2^t) / (1 - beta1^t)` and `sqrt(1 - beta2^t)`. The last entry holds for all later steps. Filled
-    /// for the first lazy parameter.
+    /// The [`correction`] of each step of a row, from 1 on. Filled for the first lazy parameter.
     corrections: Vec<[T; 2]>,
 }
 
@@ -96,7 +94,7 @@ fn correction<T: Scalar>(config: AdamConfig, step: u32) -> [T; 2] {
 }
 
 impl<T: Scalar> Group<T> {
-    /// Largest number of corrections, even if they are not yet 1. It matters only for a beta2 above 0.9998.
+    /// Largest number of corrections that are kept. For later steps, a beta2 above 0.9998 computes them for each row.
     const LONGEST: usize = 1 << 17;
 
     #[track_caller]

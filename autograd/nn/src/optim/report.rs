@@ -7,7 +7,7 @@ use std::fmt;
 /// An optimizer skips an element whose gradient is infinite or NaN. So a run survives a single overflow, but a diverged
 /// run would stop silently. Look at the report in each step: [`check`](Self::check) fails if an element was skipped. A
 /// run that should tolerate some can test [`has_only_non_finite`](Self::has_only_non_finite) over many steps.
-#[must_use = "elements whose gradient is infinite or NaN stay where they are: `check` says whether there are any"]
+#[must_use = "elements with a non-finite gradient are not updated: `check` is an error if there are any"]
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct UpdateReport {
     /// Number of updated elements. For a lazy parameter, those of the rows with a gradient.
