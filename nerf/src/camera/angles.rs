@@ -2,16 +2,16 @@
 
 use raygrad_autograd::Real;
 
-/// `sin(r) / r` and `cos(r)` for `r = sqrt(s)`, smooth through 0; `s` is at least 0.
+/// `sin(r) / r` and `cos(r)` for `r = sqrt(s)`, smooth through 0. Range of `s`: 0 or more.
 ///
-/// Written with [`Real`], so that with variables it has derivatives of every order. Each branch sees an argument that
-/// it is good for, since a gradient of 0 times infinity would be NaN.
+/// Generic over [`Real`], so that variables give derivatives of every order. Each branch gets an argument in its own
+/// domain: a gradient of 0 times infinity would be NaN.
 #[inline(always)]
 pub(crate) fn sinc_and_cos_of_root<E: Real>(s: E) -> [E; 2] {
     let one = s.like(1.0);
     let excess = s - one;
     let (near, far) = (excess.if_positive(one, s), excess.if_positive(s, one));
-    // Up to s = 1 the first terms left out are below 1e-20. `1 - s / (n (n + 1)) (1 - s / ((n + 2) (n + 3)) (..))`.
+    // Up to s = 1 the truncation error is below 1e-20. `1 - s / (n (n + 1)) (1 - s / ((n + 2) (n + 3)) (..))`.
     let series = |first: u32| {
         (0..11).rev().fold(s.like(1.0), |sum, k| {
             let n = f64::from(first + 2 * k);
@@ -23,12 +23,12 @@ pub(crate) fn sinc_and_cos_of_root<E: Real>(s: E) -> [E; 2] {
     [excess.if_positive(sinc, series(2)), excess.if_positive(root.cos(), series(1))]
 }
 
-/// `atan2(v, w) / v` for `v = sqrt(v2)`: the angle of the vector `(w, v)`, from 0 to pi, over its side `v`. Smooth
-/// through `v = 0` for `w > 0`; for `w <= 0`, `v` must not be 0.
+/// `atan2(v, w) / v` for `v = sqrt(v2)`: the angle of the vector `(w, v)`, from 0 to pi, divided by `v`. Smooth through
+/// `v = 0` for `w > 0`; for `w <= 0`, `v` must not be 0.
 #[inline(always)]
 pub(crate) fn angle_over<E: Real>(v2: E, w: E) -> E {
     let one = w.like(1.0);
-    // In r = (v/w)^2 up to 1/16 a series of atan(v/w) / (v/w).
+    // For r = (v/w)^2 up to 1/16, a series of atan(v/w) / (v/w).
     let excess = w.if_positive(v2 - w.like(0.0625) * w * w, one);
     let w_near = excess.if_positive(one, w);
     let r = excess.if_positive(v2.like(0.0), v2) / (w_near * w_near);
@@ -46,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn angles_over_sides_have_all_their_digits() {
+    fn angle_over_is_accurate_near_zero_and_pi() {
         for v in [1e-150, 1e-9, 0.1, 0.2499, 0.2501, 1.0, 7.0] {
             for w in [1.0, 0.3, 1e-3, -1e-3, -1.0] {
                 let (y, exact) = (angle_over(v * v, w), f64::atan2(v, w) / v);

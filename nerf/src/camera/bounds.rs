@@ -35,7 +35,8 @@ pub fn clip_near_far(ray: &Ray, bounds: [DVec3; 2], [near, far]: [f64; 2]) -> [f
 }
 
 impl Camera {
-    /// Whether one of `columns` x `rows` rays, evenly spaced over the image, meets a box between the distances `span`.
+    /// Returns true if one of `columns` x `rows` rays, evenly spaced over the image, intersects a box within the
+    /// distances `span`.
     pub(crate) fn meets(&self, bounds: [DVec3; 2], span: [f64; 2], [columns, rows]: [usize; 2]) -> bool {
         let place = |i: usize, count: usize, size: usize| (i as f64 + 0.5) / count as f64 * size as f64;
         (0..columns * rows).any(|i| {
@@ -54,7 +55,7 @@ mod tests {
     const UNIT: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
 
     #[test]
-    fn rays_along_axes_faces_and_edges() {
+    fn box_hits_rays_along_axes_faces_and_edges() {
         for zero in [0.0, -0.0] {
             let ray = |x: f64| Ray { origin: DVec3::new(x, 0.0, -3.0), direction: DVec3::new(zero, zero, 1.0) };
             for x in [0.0, 1.0, -1.0] {
@@ -74,7 +75,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_ends_lie_on_the_surface_and_the_middle_inside(
+        fn box_interval_ends_on_the_surface(
             o in prop::array::uniform3(-3.0..3.0f64), d in prop::array::uniform3(-1.0..1.0f64)
         ) {
             let direction = DVec3::from(d);

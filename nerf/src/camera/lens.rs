@@ -72,7 +72,7 @@ impl Lens {
     /// finite for every finite place.
     pub fn nearest(&self, place: [f64; 2]) -> DVec3 {
         let (Ok(direction) | Err(direction)) = self.solve(place);
-        // Only coefficients and places beyond all measure have no answer in numbers.
+        // Overflow leaves no finite direction; only extreme coefficients and points cause it.
         if direction.is_finite() { direction } else { DVec3::Z }
     }
 
@@ -81,13 +81,13 @@ impl Lens {
     /// Returns `None` for directions beyond the first fold of the image, and for those behind the image plane unless
     /// the lens is a fisheye or equirectangular.
     pub fn place(&self, direction: DVec3) -> Option<[f64; 2]> {
-        // Squares of what is left neither overflow nor vanish.
+        // Normalised first: squares of the components neither overflow nor underflow.
         let [x, y, z] = (direction / direction.abs().max_element()).to_array();
         let place = match self.distortion() {
             Some(distortion) => {
                 let before = match distortion {
                     Distortion::Rational(_) => (z > 0.0).then(|| maps::perspective([x, y, z])),
-                    // All directions around it are as near to straight behind, so it has no place.
+                    // The direction straight behind is the limit of all azimuths, so it has no point.
                     Distortion::ThinPrism(_) => (z > 0.0 || x != 0.0 || y != 0.0).then(|| maps::equidistant([x, y, z])),
                 }?;
                 distortion.domain().holds(before).then(|| distortion.of(before))?
@@ -179,7 +179,7 @@ impl Lens {
         }
     }
 
-    /// The distortion of the image plane, of lenses that are made of one.
+    /// The image-plane distortion of Brown and fisheye lenses.
     fn distortion(&self) -> Option<Distortion> {
         match *self {
             Lens::Brown { k: [k1, k2, k3, k4, k5, k6], p: [p1, p2] } => {
@@ -192,7 +192,7 @@ impl Lens {
         }
     }
 
-    /// The direction of a place, or else the outermost one towards there.
+    /// The direction of a point; as an error, the outermost direction towards it.
     fn solve(&self, [x, y]: [f64; 2]) -> std::result::Result<DVec3, DVec3> {
         if let Some(distortion) = self.distortion() {
             let direction = |place: [f64; 2]| match distortion {
@@ -203,7 +203,8 @@ impl Lens {
         }
         match *self {
             Lens::Fov { omega } => {
-                // The angle in the formula's arc tangent; the outermost direction is square to the axis.
+                // The argument of the arc tangent in the formula. The outermost direction is at a right angle to the
+                // axis.
                 let angle = x.hypot(y) * omega.abs();
                 let side = |angle: f64| sinc(angle) / maps::twice_tangent_of_half_over(omega);
                 let direction = |angle: f64, k: f64| unit(DVec3::new(x * k, y * k, angle.cos()));
@@ -229,17 +230,17 @@ fn sinc(angle: f64) -> f64 {
     if angle == 0.0 { 1.0 } else { angle.sin() / angle }
 }
 
-/// A vector at length 1, whatever its own length.
+/// A vector scaled to length 1, without overflow or underflow.
 fn unit(v: DVec3) -> DVec3 {
     (v / v.abs().max_element()).normalize()
 }
 
-/// The direction through a place on a plane at distance 1.
+/// The direction through a point of the plane at distance 1.
 fn before([x, y]: [f64; 2]) -> DVec3 {
     unit(DVec3::new(x, y, 1.0))
 }
 
-/// The direction at an angle to the axis, given as its components.
+/// The direction at an angle to the axis, which is given by its components.
 fn at_angle([x, y]: [f64; 2]) -> DVec3 {
     let angle = x.hypot(y);
     let k = sinc(angle);

@@ -25,12 +25,13 @@ pub struct Ndc {
     pub near: f64,
 }
 
-/// The factor by which it is wider than the cameras' views: renders are taken beside them, and refined cameras move.
+/// The factor by which the frustum exceeds the cameras' views. Renders come from poses beside the cameras, and pose
+/// refinement moves cameras.
 const MARGIN: f64 = 1.1;
-/// The picture is at most so much wider than that of the usual camera: 15 degrees to either side of what is 60 degrees
-/// wide.
+/// The largest width of the frustum, as a multiple of the median camera's. It allows rotations of 15 degrees to either
+/// side at a width of 60 degrees.
 const TURNED: f64 = 1.75;
-/// No camera is so many times as far from the middle of all as the usual one.
+/// The largest distance of a camera from the mean position, as a multiple of the median distance.
 const LOST: f64 = 5.0;
 
 impl Ndc {
@@ -45,7 +46,7 @@ impl Ndc {
         let bad =
             |what: &str| Err(Error::setting("scene-type", format!("cannot be forward-facing: {what}; use unbounded")));
         let back = mean(|camera| camera.pose.matrix3.z_axis).normalize();
-        // Of a flight to and fro no side is up.
+        // The mean of a flight to and fro has no up direction.
         let up = mean(|camera| camera.pose.matrix3.y_axis);
         let up = if up.length() < 0.1 { cameras.first().map_or(up, |camera| camera.pose.matrix3.y_axis) } else { up };
         let right = up.cross(back).normalize();
@@ -56,7 +57,7 @@ impl Ndc {
         let slopes = |camera: &Camera, axes: DMat3| {
             camera.border().fold(DVec2::ZERO, |most, direction| {
                 let local = axes.transpose() * direction;
-                // What is level with the picture, or behind it, is infinitely wide.
+                // Directions parallel to the image plane or behind it make the frustum infinitely wide.
                 most.max(if local.z < 0.0 { local.xy().abs() / -local.z } else { DVec2::INFINITY })
             })
         };
@@ -88,7 +89,7 @@ impl Ndc {
     /// Returns the frustum for a near plane of `to`, where that of [`around`](Self::around) was `from`.
     #[must_use]
     pub fn with_near(self, from: f64, to: f64) -> Self {
-        // In the corners of a picture, distances are longer than depths.
+        // `near` is a distance along rays, and the rays through the corners are longer than their depth.
         let depth = 1.0 / (1.0 + self.slopes[0].powi(2) + self.slopes[1].powi(2)).sqrt();
         Ndc { near: self.near + depth * (to - from), ..self }
     }
@@ -111,7 +112,7 @@ impl Ndc {
         let depth = self.axes.z_axis.dot(self.eye - place).max(self.near);
         let ahead = self.axes.z_axis.dot(self.eye - camera.pose.translation);
         let wide = (0..2).map(|axis| 2.0 * self.slopes[axis] * camera.focal[axis]).fold(0.0, f64::max);
-        // A camera may stand at the place, or beyond it.
+        // A camera may be at the point, or beyond it.
         wide * depth / (depth - ahead).max(1e-3 * depth)
     }
 }
@@ -121,7 +122,8 @@ mod tests {
     use super::*;
     use crate::camera::lens::Lens;
 
-    /// Looks along +y from a place, turned by so many degrees to the left; 53 degrees wide and 44 high.
+    /// A camera that looks along +y from `eye`, turned to the left by `degrees`, with a view 53 degrees wide and 44
+    /// high.
     fn camera(eye: [f64; 3], degrees: f64) -> Camera {
         let (eye, (sin, cos)) = (DVec3::from(eye), degrees.to_radians().sin_cos());
         let pose = Camera::look_at(eye, eye + DVec3::new(-sin, cos, 0.0), DVec3::Z);
@@ -129,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn ndc_holds_all_that_cameras_see() {
+    fn ndc_contains_the_views_of_all_cameras() {
         let cameras = [camera([-1.0, 0.1, 0.0], 5.0), camera([1.0, -0.2, 0.3], 12.0), camera([0.3, 0.0, -0.4], 1.0)];
         let ndc = Ndc::around(&cameras, 0.5).unwrap();
         ndc.check().unwrap();
@@ -149,7 +151,7 @@ mod tests {
         }
         assert!(widest.max_element() <= 1.0 && widest.min_element() > 0.8, "{widest}");
         assert!(nearest >= ndc.near && nearest < ndc.near + 0.1, "{nearest} {}", ndc.near);
-        // A margin wider than the border of the one that is turned most, by 6 degrees from the mean to the left, where x is below 0.
+        // The margin is added to the camera that is turned most: by 6 degrees from the mean, towards negative x.
         let expected = 1.1 * (0.5_f64.atan() + 6.0_f64.to_radians()).tan();
         assert!((ndc.slopes[0] - expected).abs() < 0.01, "{} {expected}", ndc.slopes[0]);
         let mirrored =
@@ -166,20 +168,20 @@ mod tests {
     }
 
     #[test]
-    fn one_camera_sees_its_own_picture() {
+    fn ndc_of_one_camera_is_its_view() {
         let alone = camera([1.0, 2.0, 3.0], 0.0);
         let ndc = Ndc::around([&alone], 0.7).unwrap();
         assert!(ndc.eye.distance(DVec3::new(1.0, 2.0, 3.0)) < 1e-12, "{}", ndc.eye);
         assert!((ndc.slopes[0] - 1.1 * 0.5).abs() < 1e-12 && (ndc.slopes[1] - 1.1 * 0.4).abs() < 1e-12, "{ndc:?}");
-        // The depth of its corners, a little farther out.
+        // The near plane is at the depth of corners at the distance 0.7.
         let depth = 0.7 / (1.0 + 0.55_f64.powi(2) + 0.44_f64.powi(2)).sqrt();
         assert!((ndc.near - depth).abs() < 1e-12, "{}", ndc.near);
         assert!((ndc.with_near(0.7, 1.4).near - 2.0 * depth).abs() < 1e-12);
-        // Pixels lie at the place's depth; nothing is nearer than the near plane.
+        // The pixels are counted at the depth of the point, which is at least the near plane.
         assert!((ndc.pixels(&alone, DVec3::new(9.0, 5.0, 1.0)) - 110.0).abs() < 1e-9);
         let tall = Camera { focal: [50.0, 200.0], ..alone.clone() };
         assert!((ndc.pixels(&tall, DVec3::new(9.0, 5.0, 1.0)) - 176.0).abs() < 1e-9);
-        // Three, half a width beside the middle, have it as far behind them as it takes; the near plane is that of the hindmost.
+        // Of three cameras, half a width beside the middle, the eye is behind all; the rearmost sets the near plane.
         let row = [camera([-0.44, 0.1, 0.0], 0.0), camera([0.44, 0.1, 0.0], 0.0), camera([0.0, 0.0, 0.0], 0.0)];
         let ndc = Ndc::around(&row, 0.0).unwrap();
         assert!(ndc.eye.distance(DVec3::new(0.0, 0.1 - 0.8, 0.0)) < 1e-12, "{}", ndc.eye);
@@ -204,8 +206,8 @@ mod tests {
     }
 
     #[test]
-    fn a_flight_to_and_fro_has_a_side_that_is_up() {
-        // Looking down, every other strip turned by half a circle.
+    fn ndc_of_flight_to_and_fro_has_an_up_axis() {
+        // Cameras look down; every other strip is turned by half a turn.
         let strip = |i: usize| {
             let eye = DVec3::new(i as f64, 0.1 * i as f64, 9.0);
             let up = if i.is_multiple_of(2) { DVec3::Y } else { DVec3::NEG_Y };
@@ -217,9 +219,9 @@ mod tests {
     }
 
     #[test]
-    fn cameras_that_do_not_all_look_ahead_are_told_so() {
+    fn ndc_of_other_scenes_is_an_error() {
         let error = |cameras: &[Camera], near: f64| Ndc::around(cameras, near).unwrap_err().to_string();
-        // Half of the width is 27 degrees, and 1.75 times as wide 41.
+        // Half of the median width is 27 degrees; the tangent of 41 degrees is 1.75 times as large.
         let turned = |degrees: f64| [camera([0.0; 3], -degrees), camera([1.0, 0.0, 0.0], degrees)];
         assert!(Ndc::around(&turned(14.0), 1.0).is_ok());
         assert!(
@@ -227,7 +229,7 @@ mod tests {
             "{}",
             error(&turned(15.0), 1.0)
         );
-        // An arc of 60 degrees about an object is none either.
+        // An arc of 60 degrees around an object is not forward-facing either.
         let arc = |degrees: f64| {
             let (sin, cos) = degrees.to_radians().sin_cos();
             camera([4.0 * sin, -4.0 * cos, 0.0], degrees)

@@ -46,10 +46,10 @@ impl Keyframe {
     }
 }
 
-/// The rotation from one pose to another, as a vector in the first one's axes of a length up to pi.
+/// The rotation between two poses, as a vector in the axes of the first, of length 0 to pi.
 fn turn(from: &DAffine3, to: &DAffine3) -> DVec3 {
     let turn = DQuat::from_mat3(&(from.matrix3.transpose() * to.matrix3));
-    // Of the two quaternions of a rotation that of the short way.
+    // Of the two quaternions of a rotation, the shorter turn.
     (if turn.w < 0.0 { -turn } else { turn }).to_scaled_axis()
 }
 
@@ -79,18 +79,18 @@ pub enum Curve {
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraPath {
     keys: Vec<Keyframe>,
-    /// The time of each keyframe, from 0; of a closed path, the first once more.
+    /// The time of each keyframe, from 0. A closed path has the first one again at the end.
     times: Vec<f64>,
-    /// The curve's parameter there.
+    /// The curve's parameter at each time.
     knots: Vec<f64>,
     closed: bool,
     curve: Curve,
 }
 
-/// A leg takes at least this share of the time of the usual one: keys in one place are passed, and not skipped.
+/// The shortest leg, as a share of the median one. Keyframes at one place keep a duration above 0.
 const LEAST_LEG: f64 = 1e-3;
 
-/// A leg takes at least this share of the time of the longest, which no sum of times makes vanish.
+/// The shortest time of a leg, as a share of the longest. Sums of times keep it apart.
 const LEAST_TIME: f64 = 1e-6;
 
 impl CameraPath {
@@ -153,7 +153,7 @@ impl CameraPath {
             return self.keys[0];
         }
         let time = share.clamp(0.0, 1.0) * self.length();
-        // The last key ends the last leg.
+        // The last keyframe belongs to the last leg.
         let leg = self.times[1..self.times.len() - 1].partition_point(|reached| *reached <= time);
         let window: [(f64, Keyframe); 4] = std::array::from_fn(|i| self.key(leg as isize + i as isize - 1));
         let share = (time - self.times[leg]) / self.leg(leg)[0];
@@ -163,20 +163,20 @@ impl CameraPath {
         }
     }
 
-    /// The time that a leg takes, and by how much the parameter rises in it.
+    /// The time of a leg and the increase of the parameter in it.
     fn leg(&self, leg: usize) -> [f64; 2] {
         [&self.times, &self.knots].map(|of| of[leg + 1] - of[leg])
     }
 
-    /// By how much the parameter has risen after a share of a leg's time: Hermite's polynomial.
+    /// The increase of the parameter after a share of a leg's time, by a cubic Hermite polynomial.
     fn passed(&self, leg: usize, share: f64) -> f64 {
         let ([time, rise], left) = (self.leg(leg), 1.0 - share);
         let [start, end] = [leg, leg + 1].map(|key| time * self.speed(key));
         share * share * (3.0 - 2.0 * share) * rise + share * left * (left * start - share * end)
     }
 
-    /// How fast the parameter rises at a key: the weighted harmonic mean of the legs around it, and at an end what the
-    /// slope of a parabola through three keys is, but not backwards.
+    /// The derivative of the parameter at a keyframe: the weighted harmonic mean of the adjacent legs. At an end it is
+    /// the slope of a parabola through three keyframes, and at least 0.
     fn speed(&self, key: usize) -> f64 {
         let legs = self.times.len() - 1;
         let of = |leg: usize| {
@@ -210,7 +210,7 @@ impl CameraPath {
         self.times[self.times.len() - 1]
     }
 
-    /// A key and its parameter; there are some before the first and after the last.
+    /// A keyframe and its parameter, extrapolated before the first and after the last.
     fn key(&self, i: isize) -> (f64, Keyframe) {
         let count = self.keys.len() as isize;
         if self.closed {
@@ -224,7 +224,7 @@ impl CameraPath {
         let inner = if last == 0 { 1 } else { last - 1 };
         let [(end, key), (before, other)] = [self.key(last), self.key(inner)];
         let beyond = match self.curve {
-            // As if it went on as it began.
+            // Extrapolates the end leg linearly.
             Curve::Through => other.mix(&key, 2.0),
             Curve::Near => key,
         };
@@ -232,13 +232,13 @@ impl CameraPath {
     }
 }
 
-/// The first and the last key of each leg.
+/// The first and the last keyframe of each leg.
 fn legs(keys: &[Keyframe], closed: bool) -> Vec<[usize; 2]> {
     let count = if closed && keys.len() > 1 { keys.len() } else { keys.len().saturating_sub(1) };
     (0..count).map(|i| [i, (i + 1) % keys.len()]).collect()
 }
 
-/// The pyramid: between neighbours, between those, and between these, each by the parameters that it stands for.
+/// The pyramid of Barry and Goldman: linear interpolation between neighbours by their parameters, three times.
 fn through(keys: [(f64, Keyframe); 4], place: f64) -> Keyframe {
     let knots = keys.map(|(knot, _)| knot);
     let mix = |from: &Keyframe, to: &Keyframe, [start, end]: [usize; 2]| {
@@ -249,7 +249,7 @@ fn through(keys: [(f64, Keyframe); 4], place: f64) -> Keyframe {
     mix(&second[0], &second[1], [1, 2])
 }
 
-/// The weighted mean by the uniform cubic B-spline's weights.
+/// The mean of keyframes, weighted by the uniform cubic B-spline.
 fn near(keys: [Keyframe; 4], u: f64) -> Keyframe {
     let v = 1.0 - u;
     let middle = |u: f64| (3.0 * u * u * u - 6.0 * u * u + 4.0) / 6.0;

@@ -88,13 +88,13 @@ impl Camera {
         Some([x * self.focal[0] + self.centre[0], y * self.focal[1] + self.centre[1]])
     }
 
-    /// Whether a point in world coordinates projects into the image.
+    /// Returns true if a point in world coordinates projects into the image.
     pub(crate) fn shows(&self, point: DVec3) -> bool {
         let [width, height] = [self.width as f64, self.height as f64];
         self.pixel_of(point).is_some_and(|[x, y]| (0.0..width).contains(&x) && (0.0..height).contains(&y))
     }
 
-    /// Directions of rays along the border of the image, where the lens sees any; otherwise all.
+    /// Directions of rays along the border of the image that the lens sees; if it sees none, of the whole border.
     pub(crate) fn border(&self) -> impl Iterator<Item = DVec3> {
         /// Places along each side.
         const PLACES: usize = 16;
@@ -110,7 +110,7 @@ impl Camera {
         [(x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1]]
     }
 
-    /// Column and row of the pixel with this index, row by row.
+    /// Column and row of the pixel with this index, in row-major order.
     pub(crate) fn place_of(&self, pixel: usize) -> [usize; 2] {
         [pixel % self.width, pixel / self.width]
     }

@@ -6,15 +6,17 @@ use raygrad_autograd::{Real, Scalar, Shape, Var, record};
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::{Tensor, check::Entry};
 
-/// The matrix, row by row, of the rotation by `|w|` radians about `w` (Rodrigues): `1 + a K + b K^2` with the matrix K
-/// of `w x`, `a = sin|w| / |w|` and `b = (1 - cos|w|) / |w|^2`. Both come from half the angle, as for a quaternion: `b`
-/// as `2 sin^2(|w|/2) / |w|^2` has all its digits, and rounding leaves the matrix a rotation, also near half a turn.
+/// The row-major matrix of the rotation by `|w|` radians about `w` (Rodrigues).
+///
+/// It is `1 + a K + b K^2` with the matrix K of `w x`, `a = sin|w| / |w|` and `b = (1 - cos|w|) / |w|^2`. Both come
+/// from half the angle, as for a quaternion. `b` as `2 sin^2(|w|/2) / |w|^2` is accurate, and the matrix stays a
+/// rotation up to half a turn.
 #[inline(always)]
 pub(crate) fn exp<E: Real>([x, y, z]: [E; 3]) -> [E; 9] {
     let [xx, yy, zz] = [x * x, y * y, z * z];
     let s = xx + yy + zz;
     let [half, cos] = sinc_and_cos_of_root(s.like(0.25) * s);
-    // The quaternion's length is 1 but for rounding, which would leave the matrix no rotation.
+    // The quaternion's length is 1 up to rounding; dividing by it keeps the matrix a rotation.
     let length = cos * cos + s.like(0.25) * s * half * half;
     let b = s.like(0.5) * half * half / length;
     let a = half * cos / length;
@@ -84,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_matrix_is_that_of_an_axis_and_an_angle() {
+    fn exp_is_the_rotation_about_an_axis() {
         let turned = DMat3::from_axis_angle(DVec3::Y, 0.25);
         assert!(rotation_matrix(DVec3::new(0.0, 0.25, 0.0)).abs_diff_eq(turned, 1e-15));
     }

@@ -5,13 +5,14 @@ use crate::numbers::mean;
 use glam::{DAffine3, DVec3};
 use std::f64::consts::TAU;
 
-/// Turns on the way.
+/// Turns of the spiral.
 const TURNS: f64 = 2.0;
-/// How often it goes to and fro meanwhile, for each turn.
+/// Oscillations along the optical axis for each turn.
 const TO_AND_FRO: f64 = 0.5;
-/// Unit vectors whose mean is shorter have no direction in common: those of a cone of 66 degrees to each side.
+/// The smallest length of the mean of unit vectors with a common direction: a cone with a half angle of 66 degrees has
+/// it.
 const LEAST_MEAN: f64 = 0.7;
-/// Cameras of which no more than this share stand farther from the average one, along an axis, than the spiral goes.
+/// The quantile of the cameras' offsets along an axis that becomes the amplitude.
 const WITHIN: f64 = 0.9;
 
 /// A spiral path around a pose that looks at one point (LLFF, Mildenhall et al. 2019).
@@ -58,7 +59,7 @@ impl Spiral {
     }
 }
 
-/// The value that [`WITHIN`] of the values do not exceed, between two of them in proportion.
+/// The [`WITHIN`] quantile of the values, with linear interpolation.
 fn within(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     let at = WITHIN * (values.len() - 1) as f64;
@@ -71,14 +72,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_spiral_is_that_of_the_published_code() {
-        // `render_path_spiral` and `poses_avg` of LLFF's `load_llff.py`, by hand, for a middle that is turned.
+    fn spiral_matches_llff_code() {
+        // `render_path_spiral` and `poses_avg` of LLFF's `load_llff.py`, evaluated by hand for a rotated centre pose.
         let pose = Camera::look_at(DVec3::new(1.0, -4.0, 2.0), DVec3::new(0.5, 3.0, 1.0), DVec3::Z);
         let spiral = Spiral { pose, radii: [0.5, 0.3, 0.2], focus: 6.0 };
         let poses = spiral.poses(8);
         let target = pose.translation - 6.0 * pose.matrix3.z_axis;
         let root = 0.5_f64.sqrt();
-        // Angles are multiples of half a turn, of which the third coordinate has the half.
+        // Angles are multiples of half a turn; the third coordinate uses half the angle.
         for (i, expected) in [
             (0, [0.5, 0.0, 0.0]),
             (1, [0.0, -0.3, -0.2 * root]),
@@ -99,7 +100,7 @@ mod tests {
 
     #[test]
     fn spiral_winds_around_the_average_camera() {
-        // Eleven in a row, a unit apart, all looking along -y; heights and depths differ less.
+        // Eleven cameras in a row, 1 apart, all looking along -y. Heights and depths vary less.
         let camera = |i: usize| {
             let x = i as f64;
             let eye = DVec3::new(x, 2.0 + 0.01 * x, 5.0 - 0.1 * x);
@@ -110,12 +111,12 @@ mod tests {
         assert!(spiral.pose.translation.distance(DVec3::new(5.0, 2.05, 4.5)) < 1e-12);
         assert!(spiral.pose.matrix3.z_axis.distance(DVec3::Y) < 1e-12);
         assert!(spiral.pose.matrix3.y_axis.distance(DVec3::Z) < 1e-12);
-        // Distances are 0 and twice each of 1 to 5, eleven in all: nine tenths of the way, the tenth of them.
+        // The distances are 0 and twice each of 1 to 5. The 0.9 quantile of these eleven is the tenth.
         for (radius, unit) in spiral.radii.iter().zip([1.0, 0.1, 0.01]) {
             assert!((radius - 5.0 * unit).abs() < 1e-12, "{:?}", spiral.radii);
         }
         let few = Spiral::around(&cameras[..3]).unwrap();
-        // Of 0, 1 and 1 it is 1; of one camera nothing.
+        // The quantile of 0, 1 and 1 is 1. A single camera has amplitudes of 0.
         assert!((few.radii[0] - 1.0).abs() < 1e-12);
         assert_eq!(Spiral::around(&cameras[..1]).unwrap().radii, [0.0; 3]);
         assert!((within(vec![3.0, 1.0]) - 2.8).abs() < 1e-12);

@@ -1,15 +1,16 @@
 //! The domain of a distortion: how far from the axis it is monotonic, before the image folds back.
 
-/// The highest power of the determinant of a distortion along a line from the axis, and one.
+/// The number of coefficients of a distortion's determinant along a line from the axis.
 const TERMS: usize = 23;
-/// Halvings of an interval until its ends are neighbouring numbers.
+/// Bisections until the ends of an interval are neighbouring floats.
 const HALVINGS: u32 = 54;
 
-/// A distortion `x N(s) / D(s) + x (q . x) 2 + q s + t s` of places `x` with `s = |x|^2`, and where it is of use: from
-/// the axis up to the first place at which its Jacobian's determinant or `D` is no longer positive.
+/// A distortion `x N(s) / D(s) + x (q . x) 2 + q s + t s` of points `x` with `s = |x|^2`, and its domain.
+///
+/// The domain extends from the axis to the first point at which the determinant of the Jacobian or `D` is not positive.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Domain {
-    /// Coefficients of the numerator, from that of 1.
+    /// Coefficients of the numerator, from the constant one.
     pub(crate) numerator: [f64; 5],
     /// Coefficients of the denominator.
     pub(crate) denominator: [f64; 4],
@@ -17,27 +18,27 @@ pub(crate) struct Domain {
     pub(crate) tangential: [f64; 2],
     /// Thin-prism coefficients.
     pub(crate) prism: [f64; 2],
-    /// The farthest from the axis that a place may lie, whatever the distortion.
+    /// The largest distance from the axis, for any distortion.
     pub(crate) limit: f64,
 }
 
 impl Domain {
-    /// Whether places depend on the distance from the axis alone.
+    /// Returns true if the distortion depends on the distance from the axis alone.
     pub(crate) fn is_radial(&self) -> bool {
         self.tangential == [0.0; 2] && self.prism == [0.0; 2]
     }
 
-    /// Whether the distortion is of use at this place.
+    /// Returns true if the point is inside of the domain.
     pub(crate) fn holds(&self, [x, y]: [f64; 2]) -> bool {
         let r = x.hypot(y);
         r <= self.limit && (self.surely_holds(r) || self.edge([x / r, y / r], r).is_none())
     }
 
-    /// Whether the Jacobian's symmetric part is surely positive definite within this distance of the axis, which costs
-    /// little to know. The map is then in order there.
+    /// Returns true if a cheap bound proves the Jacobian's symmetric part positive definite within the distance `r`.
+    /// The map is invertible there.
     ///
-    /// The eigenvalues of its radial part are `N / D` and `slope / D^2`, of which the lesser is the latter at some
-    /// smaller distance, and the other terms take away at most `(6 |q| + 2 |t|) r`.
+    /// The eigenvalues of its radial part are `N / D` and `slope / D^2`. The smaller one is the latter at some smaller
+    /// distance. The other terms subtract at most `(6 |q| + 2 |t|) r`.
     fn surely_holds(&self, r: f64) -> bool {
         let [q, t] = [self.tangential, self.prism].map(|[x, y]| x.hypot(y));
         let (lost, s) = ((6.0 * q + 2.0 * t) * r, r * r);
@@ -62,8 +63,8 @@ impl Domain {
         slope
     }
 
-    /// The distance from the axis up to which the distortion is of use in this direction, of length 1; `None` if that
-    /// is more than `end`.
+    /// The distance from the axis to the end of the domain in the direction `e` of length 1; `None` if it is more than
+    /// `end`.
     pub(crate) fn edge(&self, e: [f64; 2], end: f64) -> Option<f64> {
         let s = end * end;
         let pole = first_root(&self.denominator, s).map(f64::sqrt);
@@ -80,8 +81,8 @@ impl Domain {
 
     /// `D^3` times the determinant of the Jacobian at the distance `r` in the direction `e`, as a polynomial of `r`.
     ///
-    /// Along `e` and across, with the parts `qe`, `qn` of `q` and `te`, `tn` of `t`, the Jacobian's rows are
-    /// `slope / D^2 + (6 qe + 2 te) r, 2 qn r` and `2 (qn + tn) r, N / D + 2 qe r`.
+    /// `qe`, `qn` and `te`, `tn` are the components of `q` and `t` along `e` and across it. The rows of the Jacobian
+    /// along `e` and across it are `slope / D^2 + (6 qe + 2 te) r, 2 qn r` and `2 (qn + tn) r, N / D + 2 qe r`.
     fn determinant(&self, [x, y]: [f64; 2]) -> [f64; TERMS] {
         let parts = |[u, v]: [f64; 2]| [u * x + v * y, v * x - u * y];
         let ([qe, qn], [te, tn]) = (parts(self.tangential), parts(self.prism));
@@ -103,7 +104,7 @@ impl Domain {
     }
 }
 
-/// A polynomial of `r^2` as one of `r`.
+/// Rewrites a polynomial of `r^2` as one of `r`.
 fn in_distance<const N: usize>(p: &[f64]) -> [f64; N] {
     std::array::from_fn(|k| if k % 2 == 0 { p[k / 2] } else { 0.0 })
 }
@@ -119,8 +120,8 @@ fn product<const N: usize>(p: &[f64], q: &[f64]) -> [f64; N] {
     out
 }
 
-/// The coefficients of a polynomial in Bernstein's form on `0..=end`, between the least and the greatest of which its
-/// values lie, and how many they are.
+/// The Bernstein coefficients of a polynomial on `0..=end`, and their number. The values of the polynomial lie between
+/// the least and the greatest of them.
 fn bernstein<const N: usize>(p: &[f64; N], end: f64) -> ([f64; N], usize) {
     let degree = (1..N).rev().find(|&i| p[i] != 0.0).unwrap_or(0);
     let (mut b, mut power, mut choose) = (*p, 1.0, 1.0);
@@ -137,27 +138,28 @@ fn bernstein<const N: usize>(p: &[f64; N], end: f64) -> ([f64; N], usize) {
     (b, degree + 1)
 }
 
-/// Whether a polynomial is surely positive on `0..=end`.
+/// Returns true if the Bernstein coefficients prove a polynomial positive on `0..=end`.
 fn is_positive<const N: usize>(p: &[f64; N], end: f64) -> bool {
     let (b, count) = bernstein(p, end);
     b[..count].iter().all(|b| *b > 0.0)
 }
 
-/// The least number in `0..=end` at which a polynomial is not positive, or one just below; `None` if there is none.
+/// The least number in `0..=end` at which a polynomial is not positive, or one just below it; `None` if there is none.
 fn first_root<const N: usize>(p: &[f64; N], end: f64) -> Option<f64> {
     let end = end.min(f64::MAX);
     let (mut b, count) = bernstein(p, end);
     let share = descend(&mut b[..count], [0.0, 1.0], HALVINGS)?;
-    // A root has the digits of the interval that it is looked for in.
+    // The precision of a root is relative to the interval searched, so a small root needs a smaller interval.
     let nearer = end * (2.0 * share + 1e-6);
     if share > 0.1 || !(nearer > f64::MIN_POSITIVE) {
         return Some(share * end);
     }
-    // What is positive on the whole of the nearer interval had no root here but by rounding or overflow.
+    // If the polynomial is positive on the nearer interval, rounding or overflow made the root.
     Some(first_root(p, nearer).unwrap_or(nearer))
 }
 
-/// [`first_root`] of a polynomial in Bernstein's form on an interval, the nearer half first (de Casteljau).
+/// [`first_root`] of a polynomial in Bernstein form on an interval, by de Casteljau's subdivision, the nearer half
+/// first.
 fn descend(b: &mut [f64], [low, high]: [f64; 2], halvings: u32) -> Option<f64> {
     if b.iter().all(|b| *b > 0.0) {
         return None;
@@ -172,6 +174,6 @@ fn descend(b: &mut [f64], [low, high]: [f64; 2], halvings: u32) -> Option<f64> {
             b[j] = 0.5 * (b[j] + b[j + 1]);
         }
     }
-    // What is left of `b` is the second half: its last entry is the end, and each before it the mean of one step more.
+    // `b` now holds the coefficients of the second half.
     descend(first, [low, middle], halvings - 1).or_else(|| descend(b, [middle, high], halvings - 1))
 }

@@ -14,23 +14,24 @@ pub(crate) enum Distortion {
     ThinPrism([f64; 8]),
 }
 
-/// Newton steps that are enough from a good start.
+/// Newton steps from a good start.
 const STEPS: usize = 20;
-/// Newton steps between bounds, each at least as good as halving an interval of doubles.
+/// Newton steps between bounds. Each is at least as good as a bisection of an interval of doubles.
 const MOST_STEPS: usize = 1100;
-/// A last step, as a part of the distance: Newton's method leaves of it the square.
+/// The relative size of the last step. Newton's method converges quadratically, so the error is about its square.
 const ALMOST: f64 = 1e-9;
-/// Part of a place by which a solution may miss it. Most miss it by some roundings; what misses by more is none.
+/// The largest relative residual of a solution. Most residuals are a few roundings.
 const MISS: f64 = 1e-11;
-/// The distance to a fold, as a part of that to the axis, at which the outermost direction stays: as near as an inverse
-/// can tell, since a place depends on it by its square alone.
+/// The distance of the outermost direction, as a share of the distance to the fold.
+///
+/// No inverse can be more precise: near a fold a point depends on the square of the distance to it.
 const INSIDE: f64 = 1.0 - 1e-8;
-/// The least part of the way to a place that is worth a step, and how many steps are tried.
+/// The smallest step along the way to a point, as a share of it, and the largest number of steps.
 const LEAST_STEP: f64 = 1e-10;
 const MOST_TRIES: usize = 400;
 
 impl Distortion {
-    /// Where it puts a place.
+    /// The distorted position of a point.
     #[inline]
     pub(crate) fn of<E: Real>(&self, place: [E; 2]) -> [E; 2] {
         let lift = |c: &[f64; 8]| c.map(|c| place[0].like(c));
@@ -40,7 +41,7 @@ impl Distortion {
         }
     }
 
-    /// Where it puts the distance `r` from the axis, but for tangential and prism terms.
+    /// The distorted distance of `r` from the axis, without tangential and prism terms.
     #[inline]
     fn of_distance<E: Real>(&self, r: E) -> E {
         let lift = |c: &[f64; 8]| c.map(|c| r.like(c));
@@ -50,7 +51,7 @@ impl Distortion {
         }
     }
 
-    /// Where it is of use.
+    /// The domain in which the distortion is invertible.
     pub(crate) fn domain(&self) -> Domain {
         match *self {
             Distortion::Rational([k1, k2, k3, k4, k5, k6, p1, p2]) => Domain {
@@ -70,7 +71,8 @@ impl Distortion {
         }
     }
 
-    /// The place that is put at `target`, within the [`Domain`]. If there is none, the outermost one towards there.
+    /// The point within the [`Domain`] that the distortion maps to `target`; as an error, the outermost point towards
+    /// it.
     pub(crate) fn undo(&self, target: [f64; 2]) -> Result<[f64; 2], [f64; 2]> {
         let domain = self.domain();
         if domain.is_radial() {
@@ -84,8 +86,7 @@ impl Distortion {
         }
     }
 
-    /// The distance that is put at `target` by the radial factor, within a domain that is radial. If there is none, the
-    /// outermost one.
+    /// The distance that the radial factor maps to `target`, within a radial domain; as an error, the largest distance.
     fn undo_distance(&self, domain: &Domain, target: f64) -> Result<f64, f64> {
         let mut r = target;
         for _ in 0..STEPS {
@@ -103,14 +104,14 @@ impl Distortion {
         self.undo_distance_slowly(domain, target)
     }
 
-    /// How far beyond `target` the distance `r` is put, and the derivative of that.
+    /// The residual of the distance `r` for `target`, and its derivative.
     #[inline]
     fn miss(&self, r: f64, target: f64) -> [f64; 2] {
         let Dual { value, slopes: [slope] } = self.of_distance(Dual { value: r, slopes: [Some(1.0)] });
         [value - target, slope.unwrap_or(1.0)]
     }
 
-    /// As [`undo_distance`](Self::undo_distance), between bounds that hold the root.
+    /// [`undo_distance`](Self::undo_distance) by bisection and Newton steps between bounds of the root.
     #[cold]
     fn undo_distance_slowly(&self, domain: &Domain, target: f64) -> Result<f64, f64> {
         let mut high = target.clamp(f64::MIN_POSITIVE, domain.limit);
@@ -145,11 +146,11 @@ impl Distortion {
             }
             r = next;
         }
-        // Beside a pole neighbouring numbers have places apart; what the bounds hold is the root all the same.
+        // Near a pole neighbouring floats map far apart, so the residual of a root may be large.
         if self.miss(r, target)[0].abs() <= 1e-6 * target { Ok(r) } else { Err(outermost) }
     }
 
-    /// Newton's method from `start`; `None` unless it ends at a place that is put at `target`.
+    /// Newton's method from `start`; `None` if it does not converge to `target`.
     #[inline]
     fn newton(&self, start: [f64; 2], target: [f64; 2]) -> Option<[f64; 2]> {
         let mut place = start;
@@ -172,12 +173,12 @@ impl Distortion {
         None
     }
 
-    /// Newton's method, along the straight line to `target` by steps that it can follow, all of whose places are in the
-    /// domain: for targets near a fold and beyond.
+    /// Newton's method for targets near a fold and beyond it. Adaptive steps along the straight line to `target` keep
+    /// all points in the domain.
     #[cold]
     fn follow(&self, domain: &Domain, target: [f64; 2]) -> Result<[f64; 2], [f64; 2]> {
         let solve = |start: [f64; 2], target: [f64; 2]| self.newton(start, target).filter(|&place| domain.holds(place));
-        // As if there were no tangential terms: for strong lenses a better start than the target itself.
+        // Strong lenses need a better start than the target: the solution without tangential terms.
         let distance = size(target);
         let radial = Domain { tangential: [0.0; 2], prism: [0.0; 2], ..*domain };
         let (Ok(r) | Err(r)) = self.undo_distance(&radial, distance);
@@ -198,7 +199,7 @@ impl Distortion {
     }
 }
 
-/// The length of a vector whose square may not be a number.
+/// The length of a vector, also if its square overflows or underflows.
 fn size([x, y]: [f64; 2]) -> f64 {
     let plain = (x * x + y * y).sqrt();
     if plain > 1e-100 && plain < 1e100 { plain } else { x.hypot(y) }

@@ -25,7 +25,7 @@ pub(crate) fn fisheye_factor<E: Real>([k1, k2, k3, k4, ..]: [E; 8], s: E) -> E {
     series([k1, k2, k3, k4], s)
 }
 
-/// A place times the radial factor, plus the tangential terms.
+/// A point times the radial factor, plus the tangential terms.
 #[inline(always)]
 fn decentred<E: Real>(factor: E, [p1, p2]: [E; 2], [x, y]: [E; 2]) -> [E; 2] {
     let two = x.like(2.0);
@@ -34,14 +34,14 @@ fn decentred<E: Real>(factor: E, [p1, p2]: [E; 2], [x, y]: [E; 2]) -> [E; 2] {
     [x * factor + p1 * xy + p2 * (s + two * xx), y * factor + p1 * (s + two * yy) + p2 * xy]
 }
 
-/// OpenCV's distortion of places, with the coefficients `k1 .. k6, p1, p2`.
+/// OpenCV's distortion of points, with the coefficients `k1 .. k6, p1, p2`.
 #[inline(always)]
 pub(crate) fn rational<E: Real>(c: [E; 8], [x, y]: [E; 2]) -> [E; 2] {
     decentred(rational_factor(c, x * x + y * y), [c[6], c[7]], [x, y])
 }
 
-/// COLMAP's distortion of places of THIN_PRISM_FISHEYE, with the coefficients `k1 .. k4, p1, p2, sx1, sy1`; OpenCV's
-/// and COLMAP's of other fisheyes with zeros in place of the last four.
+/// COLMAP's distortion of points for THIN_PRISM_FISHEYE, with the coefficients `k1 .. k4, p1, p2, sx1, sy1`. With zeros
+/// for the last four it is the other fisheyes of OpenCV and COLMAP.
 #[inline(always)]
 pub(crate) fn thin_prism<E: Real>(c: [E; 8], [x, y]: [E; 2]) -> [E; 2] {
     let s = x * x + y * y;
@@ -49,13 +49,13 @@ pub(crate) fn thin_prism<E: Real>(c: [E; 8], [x, y]: [E; 2]) -> [E; 2] {
     [u + c[6] * s, v + c[7] * s]
 }
 
-/// The place, on a plane at distance 1, of a direction before the camera.
+/// The point, on the plane at distance 1, of a direction in front of the camera.
 #[inline(always)]
 pub(crate) fn perspective<E: Real>([x, y, z]: [E; 3]) -> [E; 2] {
     [x / z, y / z]
 }
 
-/// The angle between a direction and the axis, laid off towards `(x, y)`.
+/// The point at the angle between a direction and the axis from the origin, towards `(x, y)`.
 #[inline(always)]
 pub(crate) fn equidistant<E: Real>([x, y, z]: [E; 3]) -> [E; 2] {
     let factor = angle_over(x * x + y * y, z);
@@ -69,7 +69,7 @@ pub(crate) fn twice_tangent_of_half_over<E: Real>(omega: E) -> E {
     sinc / cos
 }
 
-/// The place `atan(2 r tan(omega / 2)) / omega` from the axis for a direction at `r` on a plane at distance 1.
+/// The point at `atan(2 r tan(omega / 2)) / omega` from the axis, for a direction at `r` on the plane at distance 1.
 #[inline(always)]
 pub(crate) fn field_of_view<E: Real>(omega: E, [x, y, z]: [E; 3]) -> [E; 2] {
     let stretch = twice_tangent_of_half_over(omega);

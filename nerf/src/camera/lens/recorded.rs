@@ -43,7 +43,7 @@ pub fn lens_places<'t, T: Scalar>(lens: &Lens, coefficients: &Var<'t, T>, direct
     Var::concat(&[&places[0], &places[1]], -1)
 }
 
-/// The formula with `N` variables: a direction, then coefficients.
+/// The projection of `N` variables: a direction, then coefficients.
 fn places_of<'t, T: Scalar, const N: usize>(lens: &Lens, inputs: &[Var<'t, T>]) -> [Var<'t, T>; 2] {
     record::<T, N, 2>(std::array::from_fn(|i| &inputs[i]), |x| lens.project(&x[3..], [x[0], x[1], x[2]]))
 }

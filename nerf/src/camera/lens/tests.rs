@@ -1,4 +1,4 @@
-//! What lenses are made of, against plainer ways to the same.
+//! The domain and the inverse of distortions, compared with simpler methods.
 
 use crate::camera::lens::Lens;
 use crate::camera::lens::inverse::Distortion;
@@ -10,7 +10,7 @@ fn brown(k: [f64; 6], p: [f64; 2]) -> Distortion {
     Distortion::Rational([k[0], k[1], k[2], k[3], k[4], k[5], p[0], p[1]])
 }
 
-/// The determinant of a distortion's Jacobian, by dual numbers.
+/// The determinant of a distortion's Jacobian, with dual numbers.
 fn determinant(distortion: &Distortion, [x, y]: [f64; 2]) -> f64 {
     let x = Dual { value: x, slopes: [Some(1.0), None] };
     let y = Dual { value: y, slopes: [None, Some(1.0)] };
@@ -18,7 +18,7 @@ fn determinant(distortion: &Distortion, [x, y]: [f64; 2]) -> f64 {
     a * d - b * c
 }
 
-/// The first radius at which the determinant is not positive, looked for step by step.
+/// The first radius at which the determinant is not positive, by small steps.
 fn marched(distortion: &Distortion, e: [f64; 2], end: f64) -> Option<f64> {
     let at = |r: f64| determinant(distortion, e.map(|e| e * r));
     let steps = 20_000;
@@ -32,7 +32,7 @@ fn marched(distortion: &Distortion, e: [f64; 2], end: f64) -> Option<f64> {
 }
 
 #[test]
-fn the_fold_is_where_the_determinant_first_vanishes() {
+fn fold_is_the_first_root_of_the_determinant() {
     let distortions = [
         brown([-0.5, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2]),
         brown([-0.3, 0.01, 0.0, 0.0, 0.0, 0.0], [0.0; 2]),
@@ -68,8 +68,8 @@ fn the_fold_is_where_the_determinant_first_vanishes() {
 }
 
 #[test]
-fn a_pole_ends_a_lens_as_a_fold_does() {
-    // 1 - s in the denominator: places run away towards r = 1, and come from the other side beyond.
+fn pole_ends_the_domain() {
+    // The denominator is 1 - s: points diverge towards r = 1 and change sign beyond it.
     let distortion = brown([0.0, 0.0, 0.0, -1.0, 0.0, 0.0], [0.0; 2]);
     assert!((distortion.domain().edge([1.0, 0.0], 5.0).unwrap() - 1.0).abs() < 1e-12);
     let lens = Lens::Brown { k: [0.0, 0.0, 0.0, -1.0, 0.0, 0.0], p: [0.0; 2] };
@@ -82,17 +82,17 @@ fn a_pole_ends_a_lens_as_a_fold_does() {
 }
 
 #[test]
-fn a_touch_of_zero_is_a_fold() {
-    // The slope is (1 - s)^2: zero at 1, and positive again beyond.
+fn double_root_is_a_fold() {
+    // The slope is (1 - s)^2: zero at 1, and positive again beyond it.
     let distortion = brown([-2.0 / 3.0, 0.2, 0.0, 0.0, 0.0, 0.0], [0.0; 2]);
     let edge = distortion.domain().edge([1.0, 0.0], 5.0).unwrap();
     assert!((edge - 1.0).abs() < 1e-6, "{edge}");
 }
 
 proptest! {
-    /// Whatever the coefficients: what comes out is in order on the way from the axis, and is put where it was asked for.
+    /// For any coefficients, the inverse lies in the domain and maps back to the target.
     #[test]
-    fn what_is_undone_is_before_the_fold(
+    fn inverse_stays_inside_the_fold(
         c in prop::array::uniform8(-0.3..0.3_f64), prism: bool, off in 0.0..0.2_f64, u in -1.2..1.2_f64, v in -1.2..1.2_f64,
     ) {
         let c = [c[0], c[1], c[2], c[3], if prism { off * c[4] } else { c[4] }, if prism { off * c[5] } else { c[5] },
@@ -108,9 +108,9 @@ proptest! {
         }
     }
 
-    /// What is before the fold is found again.
+    /// Distorted points of the domain come back.
     #[test]
-    fn what_is_before_the_fold_is_found(
+    fn inverse_of_distortion_is_the_point(
         c in prop::array::uniform8(-0.3..0.3_f64), prism: bool, off in 0.0..0.1_f64, turn in -PI..PI, share in 0.0..0.99_f64,
     ) {
         let c = [c[0], c[1], c[2], c[3], if prism { off * c[4] } else { c[4] }, if prism { off * c[5] } else { c[5] },

@@ -1,7 +1,7 @@
 use super::*;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-/// Keys without any symmetry.
+/// Keyframes without any symmetry.
 fn keys() -> Vec<Keyframe> {
     let key = |[x, y, z]: [f64; 3], axis: DVec3, angle: f64, angle_y: f64| Keyframe {
         pose: DAffine3 { matrix3: DMat3::from_axis_angle(axis.normalize(), angle), translation: DVec3::new(x, y, z) },
@@ -16,13 +16,13 @@ fn keys() -> Vec<Keyframe> {
     ]
 }
 
-/// How far apart two keys are, in all that they say.
+/// The distance between two keyframes, in rotation, position and field of view.
 fn apart(a: &Keyframe, b: &Keyframe) -> f64 {
     let rotation = (a.pose.matrix3 - b.pose.matrix3).to_cols_array().iter().map(|x| x * x).sum::<f64>().sqrt();
     rotation + a.pose.translation.distance(b.pose.translation) + (a.angle_y - b.angle_y).abs()
 }
 
-/// How fast a path moves, turns and zooms just before and just after a place.
+/// The velocities of position, rotation and zoom just before and just after a share of the path.
 fn speeds(path: &CameraPath, share: f64) -> [[f64; 7]; 2] {
     const STEP: f64 = 1e-5;
     [[share - STEP, share], [share, share + STEP]].map(|[from, to]| {
@@ -34,7 +34,7 @@ fn speeds(path: &CameraPath, share: f64) -> [[f64; 7]; 2] {
 }
 
 #[test]
-fn a_path_passes_its_keys_with_continuous_speeds() {
+fn path_passes_keyframes_with_continuous_speed() {
     for closed in [false, true] {
         let path = CameraPath::through(keys(), closed);
         let shares = path.shares();
@@ -49,7 +49,7 @@ fn a_path_passes_its_keys_with_continuous_speeds() {
             let most = before.iter().map(|x| x.abs()).fold(0.0, raygrad_tensor::Real::maximum);
             assert!(worst < 1e-2 * most && most > 0.1, "{share}: {before:?} {after:?}");
         }
-        // Where it begins again it goes on as it came.
+        // A closed path is continuous where it starts again.
         if closed {
             assert!(apart(&path.at(1.0), &keys()[0]) < 1e-12);
             let [before, after] = [speeds(&path, 1.0 - 2e-5)[0], speeds(&path, 2e-5)[1]];
@@ -60,7 +60,7 @@ fn a_path_passes_its_keys_with_continuous_speeds() {
 
 #[test]
 fn spline_positions_are_centripetal_hermite() {
-    // Without turns times are square roots of distances; 1, 4 and 9 apart in a line, and 4 aside.
+    // Without rotations, times are square roots of distances: 1, 4 and 9 apart, the last at a right angle.
     let places = [[0.0, 0.0], [1.0, 0.0], [5.0, 0.0], [5.0, 9.0]].map(|[x, y]| DVec3::new(x, y, 2.0));
     let keys = places.map(|place| Keyframe { pose: DAffine3::from_translation(place), angle_y: 1.0 });
     let path = CameraPath::through(keys.to_vec(), false);
@@ -68,7 +68,7 @@ fn spline_positions_are_centripetal_hermite() {
     for (share, knot) in path.shares().iter().zip(knots) {
         assert!((share - knot / 6.0).abs() < 1e-12);
     }
-    // Slopes at the inner knots, by non-uniform finite differences, and cubic Hermite polynomials between them.
+    // Slopes at the inner knots by non-uniform finite differences, with cubic Hermite polynomials between them.
     let slope = |i: usize| {
         let over = |a: usize, b: usize| (places[b] - places[a]) / (knots[b] - knots[a]);
         over(i - 1, i) - over(i - 1, i + 1) + over(i, i + 1)
@@ -81,14 +81,14 @@ fn spline_positions_are_centripetal_hermite() {
         let found = path.at((1.0 + leg * u) / 6.0).pose.translation;
         assert!(found.distance(expected) < 1e-12, "{u}: {found} {expected}");
     }
-    // It begins as straight as its first leg, mirrored: by that leg's slope to the end of it.
+    // The first leg is mirrored at its start, so the initial slope is that of the leg.
     let first = path.at(1e-6).pose.translation / 6e-6;
     assert!((first.x - 1.0).abs() < 1e-4 && first.y == 0.0, "{first}");
 }
 
 #[test]
-fn a_constant_turn_stays_one_and_is_the_short_way() {
-    // Once around the vertical, by seven keys, with signs of quaternions as they come.
+fn constant_turn_stays_constant_and_short() {
+    // One turn around the vertical by seven keyframes; the signs of the quaternions differ.
     let key = |i: usize| {
         let angle = i as f64 * TAU / 7.0;
         let eye = 3.0 * DVec3::new(angle.cos(), angle.sin(), 0.5);
@@ -101,7 +101,7 @@ fn a_constant_turn_stays_one_and_is_the_short_way() {
         let [x, y, z] = frame.pose.translation.to_array();
         assert!((x.hypot(y) - 3.0).abs() < 0.05 && (z - 1.5).abs() < 1e-12, "{i}");
         if i % 10 == 5 {
-            // Halfway, nine sixteenths of each neighbour less one of each next one.
+            // Halfway: nine sixteenths of each neighbour, minus one sixteenth of each next one.
             let [near, far] = [1.0, 3.0].map(|legs| (legs * PI / 7.0).cos());
             assert!((x.hypot(y) - 3.0 * (9.0 * near - far) / 8.0).abs() < 1e-12, "{i}");
         }
@@ -110,11 +110,11 @@ fn a_constant_turn_stays_one_and_is_the_short_way() {
         assert!(frame.pose.matrix3.y_axis.distance(DVec3::Z) < 1e-12 && (frame.angle_y - 0.8).abs() < 1e-12);
     }
     assert!(apart(&frames[10], &key(1)) < 1e-9 && apart(&frames[0], &key(0)) < 1e-9);
-    // A turn of 350 degrees is one of 10 the other way.
+    // A turn of 350 degrees is one of -10 degrees.
     let turned = |degrees: f64| Keyframe { pose: DAffine3::from_rotation_y(degrees.to_radians()), angle_y: 0.8 };
     let between = turned(5.0).mix(&turned(355.0), 0.25);
     assert!(apart(&between, &turned(2.5)) < 1e-12);
-    // And one of 210 is one of 150, whatever the sign of the quaternion that a matrix gives.
+    // A turn of 210 degrees is one of -150, for either sign of the matrix's quaternion.
     for axis in [DVec3::X, DVec3::Y, DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y, DVec3::NEG_Z] {
         let about =
             |degrees: f64| Keyframe { pose: DAffine3::from_axis_angle(axis, degrees.to_radians()), angle_y: 0.8 };
@@ -123,12 +123,12 @@ fn a_constant_turn_stays_one_and_is_the_short_way() {
 }
 
 #[test]
-fn fields_of_view_are_mixed_by_their_focal_lengths() {
+fn field_of_view_mixes_by_focal_length() {
     let key = |angle_y: f64| Keyframe { pose: DAffine3::IDENTITY, angle_y };
-    // Tangents 1 and 1/4: 1/2 is between them.
+    // The tangents are 1 and 1/4; the geometric mean is 1/2.
     let between = key(FRAC_PI_2).mix(&key(2.0 * 0.25_f64.atan()), 0.5);
     assert!((between.angle_y - 2.0 * 0.5_f64.atan()).abs() < 1e-12);
-    // 60 degrees from top to bottom of 300 pixels, whatever the width.
+    // 60 degrees span the 300 rows, for any width.
     let camera = key(PI / 3.0).camera([400, 300]);
     let focal = 150.0 * 3.0_f64.sqrt();
     assert!(camera.focal.iter().all(|f| (f - focal).abs() < 1e-9) && camera.centre == [200.0, 150.0]);
@@ -138,7 +138,7 @@ fn fields_of_view_are_mixed_by_their_focal_lengths() {
 }
 
 #[test]
-fn near_its_keys_a_path_is_a_cubic_b_spline() {
+fn near_curve_is_a_cubic_b_spline() {
     let keys = keys();
     let path = CameraPath::timed(keys.clone(), vec![1.0, 2.0, 0.5, 1.5], false, Curve::Near);
     assert_eq!(path.shares(), [0.0, 0.2, 0.6, 0.7, 1.0]);
@@ -146,7 +146,7 @@ fn near_its_keys_a_path_is_a_cubic_b_spline() {
         keys.iter().zip(weights).map(|(key, weight)| weight * of(key)).sum()
     };
     let sixths = |weights: [f64; 5]| weights.map(|weight| weight / 6.0);
-    // In the middle of a leg 1, 23, 23 and 1 of 48; at an end that goes nowhere the last key counts for the one behind it.
+    // In the middle of a leg the weights are 1, 23, 23 and 1 over 48. At an open end the last keyframe repeats.
     for (share, weights) in [
         (0.2, sixths([1.0, 4.0, 1.0, 0.0, 0.0])),
         (0.6, sixths([0.0, 1.0, 4.0, 1.0, 0.0])),
@@ -161,14 +161,14 @@ fn near_its_keys_a_path_is_a_cubic_b_spline() {
         let excess = found.pose.matrix3.transpose() * found.pose.matrix3 - DMat3::IDENTITY;
         assert!(excess.to_cols_array().iter().all(|x| x.abs() < 1e-12));
     }
-    // Of turns about one axis the mean of two that are alike is halfway, whatever the sign of a quaternion.
+    // The mean of two equal turns about one axis is halfway, for either sign of a quaternion.
     let turned = |degrees: f64| Keyframe { pose: DAffine3::from_rotation_z(degrees.to_radians()), angle_y: 0.8 };
     let around = CameraPath::timed([170.0, 170.0, 190.0, 190.0].map(turned).to_vec(), vec![1.0; 3], false, Curve::Near);
     assert!(apart(&around.at(0.5), &turned(180.0)) < 1e-12);
 }
 
 #[test]
-fn short_paths_and_keys_in_one_place_do_no_harm() {
+fn paths_of_few_or_equal_keyframes_are_finite() {
     let [a, b] = [keys()[0], keys()[1]];
     for closed in [false, true] {
         let single = CameraPath::through(vec![a], closed);
@@ -180,13 +180,13 @@ fn short_paths_and_keys_in_one_place_do_no_harm() {
         let still = CameraPath::through(vec![a, a], closed);
         assert!(still.frames(4).iter().all(|key| apart(key, &a) < 1e-12));
     }
-    // A straight line: the last frame of an open path is its end.
+    // Two keyframes give a straight line; the last frame of an open path is its end.
     let frames = CameraPath::through(vec![a, b], false).frames(5);
     assert!(apart(&frames[4], &b) < 1e-12 && apart(&frames[1], &a.mix(&b, 0.25)) < 1e-12);
 }
 
 #[test]
-fn legs_of_no_time_to_speak_of_are_passed() {
+fn legs_of_tiny_time_are_passed() {
     for (times, closed) in [(vec![1e-300, 1e6, 1.0, 1e-300], false), (vec![1e6, 1e-300, 1e-9, 1e6, 1e-300], true)] {
         for curve in [Curve::Through, Curve::Near] {
             let path = CameraPath::timed(keys(), times.clone(), closed, curve);
@@ -200,7 +200,7 @@ fn legs_of_no_time_to_speak_of_are_passed() {
 
 #[test]
 fn keyframe_times_do_not_bend_the_curve() {
-    // Equal steps along x, of which a curve through them makes x its parameter.
+    // Equal steps along x: the curve's parameter is x.
     let key = |x: f64| Keyframe { pose: DAffine3::from_translation(DVec3::new(x, 1.0, 2.0)), angle_y: 0.8 };
     let keys: Vec<Keyframe> = (0..5).map(|i| key(f64::from(i))).collect();
     let along = |path: &CameraPath, time: f64, all: f64| path.at(time / all).pose.translation.x;
@@ -217,7 +217,7 @@ fn keyframe_times_do_not_bend_the_curve() {
     ] {
         assert!((along(&open, time, 5.0) - x).abs() < 1e-12, "{time}");
     }
-    // The same of what goes on and on, and the parameter of the leg that leads from the second key to the third.
+    // The same for the closed path, in the leg from the second keyframe to the third.
     let closed = CameraPath::timed(keys[..4].to_vec(), vec![1.0, 2.0, 0.5, 1.5], true, Curve::Through);
     assert_eq!(closed.shares(), [0.0, 0.2, 0.6, 0.7]);
     for (time, leg, share) in
@@ -227,7 +227,7 @@ fn keyframe_times_do_not_bend_the_curve() {
         let found = closed.passed(leg, (time - start) / closed.leg(leg)[0]);
         assert!((found - share).abs() < 1e-12, "{time}: {found}");
     }
-    // Nor does it go back before a leg that is much quicker.
+    // The path does not reverse before a much faster leg.
     let hasty = CameraPath::timed(keys.clone(), vec![10.0, 0.1, 7.0, 0.01], false, Curve::Through);
     assert!(hasty.frames(1000).windows(2).all(|pair| pair[0].pose.translation.x <= pair[1].pose.translation.x + 1e-12));
     let two = CameraPath::timed(keys[..2].to_vec(), vec![3.0], false, Curve::Through);
