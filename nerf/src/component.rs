@@ -19,7 +19,7 @@ use std::sync::{PoisonError, RwLock};
 /// A type of component that a configuration chooses by name: [`Fields`](crate::Fields), [`Samplers`](crate::Samplers)
 /// or [`LossTerms`](crate::LossTerms).
 pub trait ComponentType: Sized + 'static {
-    /// The word for such a component in messages, such as `field`.
+    /// The name of the component type in messages, such as `field`.
     const WHAT: &'static str;
     /// The type that a configuration builds.
     type Built<T: Scalar>: 'static;
@@ -207,7 +207,7 @@ impl<'de, F: ComponentType> Deserialize<'de> for AnyConfig<F> {
         let Some(kind) = named.as_ref().and_then(Value::as_str) else {
             return Err(D::Error::custom(format!("a {} needs the field `{KIND}` with its name", F::WHAT)));
         };
-        // A copy: what is read may hold parts of its own.
+        // Copied to release the lock: the configuration may contain further components, whose reading locks it again.
         let all: Vec<Registered<F>> = {
             let registered = REGISTERED.read().unwrap_or_else(PoisonError::into_inner);
             registered.iter().filter_map(|one| one.downcast_ref()).copied().collect()

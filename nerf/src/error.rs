@@ -50,7 +50,7 @@ impl Error {
     }
 }
 
-/// The most characters of a part of a message: one may repeat a name from a file.
+/// The most characters of a part of a message: it may repeat a name from a file.
 const LONGEST: usize = 1000;
 
 /// Escapes control characters, which names from files may contain, and truncates long text.
@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn messages_are_one_line_whatever_names_files_have() {
+    fn messages_are_one_line_for_all_file_names() {
         let message = Error::field("a.json", "fra\nmes", "is `\u{1b}[2J`, not \u{e9}").to_string();
         assert_eq!(message, "a.json: `fra\\nmes`: is `\\u{1b}[2J`, not \u{e9}");
         assert_eq!(Error::setting("a\tb", "is\r0").to_string(), "`a\\tb`: is\\r0");

@@ -18,12 +18,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_failed_write_names_the_file_and_harms_nothing() {
+    fn failed_write_names_and_keeps_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let absent = folder.path().join("absent/image.png");
         let message = write_atomic(&absent, b"x").unwrap_err().to_string();
         assert!(message.contains("absent/image.png: cannot be written"), "{message}");
-        // A folder in the place of the file: the rename fails, and the temporary file goes.
+        // A folder at the path of the file makes the rename fail; the temporary file is removed.
         let taken = folder.path().join("taken");
         std::fs::create_dir(&taken).unwrap();
         std::fs::write(taken.join("inside"), b"kept").unwrap();

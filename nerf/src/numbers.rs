@@ -2,21 +2,21 @@
 
 use glam::{DMat3, DVec3};
 
-/// The value in the middle; 0 of none.
+/// The median; 0 for no values.
 pub(crate) fn median(values: impl IntoIterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.into_iter().filter(|x| !x.is_nan()).collect();
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// How far values usually are from their median: 1.4826 times the median of the distances from it, which is the standard
-/// deviation of normal numbers and is not moved by a few that are not.
+/// The robust standard deviation: 1.4826 times the median distance from the median. It equals the standard deviation of
+/// normal numbers and ignores a few outliers.
 pub(crate) fn spread(values: &[f64]) -> f64 {
     let middle = median(values.iter().copied());
     1.4826 * median(values.iter().map(|x| (x - middle).abs()))
 }
 
-/// The mean of points; NaN of none.
+/// The mean of points; NaN for none.
 pub(crate) fn mean(points: impl IntoIterator<Item = DVec3>) -> DVec3 {
     let (sum, count) = points.into_iter().fold((DVec3::ZERO, 0.0), |(sum, count), point| (sum + point, count + 1.0));
     sum / count
@@ -27,9 +27,9 @@ pub(crate) fn outer(v: DVec3) -> DMat3 {
     DMat3::from_cols(v * v.x, v * v.y, v * v.z)
 }
 
-/// The eigenvalues of a symmetric matrix, the largest first, and the eigenvector of that, by Jacobi's rotations.
+/// The eigenvalues of a symmetric matrix, the largest first, and the eigenvector of the largest, by Jacobi rotations.
 pub(crate) fn eigen<const N: usize>(mut a: [[f64; N]; N]) -> ([f64; N], [f64; N]) {
-    /// Sweeps: each squares what is left beside the diagonal.
+    /// Sweeps; each squares the off-diagonal part.
     const SWEEPS: usize = 30;
     let mut vectors: [[f64; N]; N] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
     for (p, q) in (0..SWEEPS).flat_map(|_| (0..N).flat_map(|p| (p + 1..N).map(move |q| (p, q)))) {
@@ -57,7 +57,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn outliers_do_not_move_them() {
+    fn median_and_spread_ignore_outliers() {
         let values = [1.0, 2.0, 3.0, 4.0, 1e9, f64::NAN];
         assert_eq!(median(values), 3.0);
         assert_eq!(spread(&values[..5]), 1.4826);

@@ -3,7 +3,7 @@
 use rand::{Rng, RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// A generator for one purpose: mixes the parts so that neighbouring seeds give unrelated streams.
+/// A generator for one purpose. Mixing the parts gives neighbouring seeds unrelated streams.
 pub(crate) fn stream(seed: u64, parts: [u64; 2]) -> Pcg64Mcg {
     Pcg64Mcg::seed_from_u64(mixed(seed, parts))
 }

@@ -13,7 +13,7 @@ pub(crate) fn by_name<'a, V: Deserialize<'a>>(name: &'a str) -> Option<V> {
     V::deserialize(name).ok()
 }
 
-/// An error unless `low <= value <= high`.
+/// Checks that `low <= value <= high`.
 pub(crate) fn check_range<V: PartialOrd + fmt::Display>(name: &str, value: V, low: V, high: V) -> Result<()> {
     if value >= low && value <= high {
         return Ok(());
@@ -21,7 +21,7 @@ pub(crate) fn check_range<V: PartialOrd + fmt::Display>(name: &str, value: V, lo
     Err(Error::setting(name, format!("is {value}; use {low} to {high}")))
 }
 
-/// An error if a field would have too many parameters: a failed allocation aborts the program.
+/// Checks the number of a field's parameters: a failed allocation would abort the program.
 pub(crate) fn check_parameters(count: usize) -> Result<()> {
     const MOST: usize = 1 << 33;
     if count <= MOST {
@@ -29,7 +29,7 @@ pub(crate) fn check_parameters(count: usize) -> Result<()> {
     }
     Err(Error::setting("field", format!("has {count} parameters; use smaller sizes, for at most {MOST}")))
 }
-/// Checks the learning-rate schedule of this name, if there is one.
+/// Checks a learning-rate schedule, if there is one.
 pub(crate) fn check_schedule(name: &str, schedule: Option<Schedule>) -> Result<()> {
     let Some(schedule) = schedule else { return Ok(()) };
     schedule.check().map_err(|error| Error::setting(format!("{name}.{}.{}", schedule.name(), error.name), error.what))

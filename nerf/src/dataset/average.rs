@@ -1,10 +1,10 @@
 //! Means of pixels, in the numbers that they are stored as.
 
-/// A number that a value of a pixel is stored as.
+/// The stored type of a pixel's values.
 pub(super) trait Stored: Copy {
     /// The value in 0..=1.
     fn unit(self) -> f32;
-    /// The nearest to a value in 0..=1.
+    /// Rounds a value in 0..=1.
     fn nearest(value: f64) -> Self;
 }
 
@@ -38,8 +38,9 @@ impl Stored for f32 {
     }
 }
 
-/// The averages of `channels` values over the parts of an image of the size `from` that pixels of one of the size `to` cover.
-/// In f64, so that a constant keeps its value to the last bit.
+/// Averages `channels` values over the areas of an image of the size `from` that the pixels of the size `to` cover.
+///
+/// Sums are f64, so that a constant keeps its value to the last bit.
 pub(super) fn average<S: Stored>(values: &[S], channels: usize, from: [usize; 2], to: [usize; 2]) -> Vec<S> {
     let (columns, rows) = (shares(from[0], to[0]), shares(from[1], to[1]));
     let mut out = Vec::with_capacity(to[0] * to[1] * channels);
@@ -66,9 +67,9 @@ pub(super) fn average<S: Stored>(values: &[S], channels: usize, from: [usize; 2]
     out
 }
 
-/// For each of `to` equal parts of a line of `from` pixels the pixels in it, and how much of each.
+/// For each of `to` equal parts of a line of `from` pixels, the covered pixels and the covered share of each.
 fn shares(from: usize, to: usize) -> Vec<Vec<(usize, f64)>> {
-    // In units of 1 / to of a pixel all ends are whole numbers.
+    // In units of 1 / `to` of a pixel, all ends are integers.
     let part = |i: usize| {
         let [start, end] = [i * from, (i + 1) * from];
         let covered = |pixel: usize| (end.min((pixel + 1) * to) - start.max(pixel * to)) as f64 / to as f64;

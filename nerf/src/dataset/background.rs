@@ -113,12 +113,12 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "3 or 4 channels, not 1")]
-    fn grey_has_no_place_over_a_colour() {
+    fn over_rejects_grey_images() {
         Image::new(1, 1, 1).over([0.0; 3]);
     }
 
     #[test]
-    fn only_random_draws() {
+    fn background_random_alone_draws() {
         let (mut rng, mut untouched) = (StdRng::seed_from_u64(3), StdRng::seed_from_u64(3));
         assert_eq!(Background::White.draw(&mut rng), [1.0; 3]);
         assert_eq!(Background::Black.draw(&mut rng), [0.0; 3]);
@@ -140,7 +140,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn over_stays_between_its_two_colours(c in 0.0f32..=1.0, alpha in 0.0f32..=1.0, below in 0.0f32..=1.0) {
+        fn over_stays_between_its_colours(c in 0.0f32..=1.0, alpha in 0.0f32..=1.0, below in 0.0f32..=1.0) {
             let [mixed, ..] = over(&[c, c, c, alpha], [below; 3]);
             prop_assert!(mixed >= c.min(below) - 1e-6 && mixed <= c.max(below) + 1e-6);
         }

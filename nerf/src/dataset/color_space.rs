@@ -7,7 +7,7 @@
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Cases, Formula, Real, Scalar, Var};
 
-/// Linear light and code value where the line ends and the power begins (IEC 61966-2-1).
+/// The linear and the encoded value at the end of the linear segment (IEC 61966-2-1).
 const KNEE: [f64; 2] = [0.003_130_8, 0.040_45];
 const SLOPE: f64 = 12.92;
 const OFFSET: f64 = 0.055;
@@ -25,8 +25,8 @@ pub struct SrgbEncode;
 #[derive(Debug, Clone, Copy)]
 pub struct SrgbDecode;
 
-/// `x` where it is beyond the knee, else the knee: what the power sees, so that the branch that is not taken has a
-/// finite gradient too.
+/// The maximum of `x` and the knee, as the argument of the power: its gradient must be finite when the linear branch is
+/// chosen.
 #[inline(always)]
 fn beyond<E: Real>(x: E, knee: f64) -> [E; 2] {
     let excess = x - x.like(knee);
@@ -41,7 +41,7 @@ impl Formula<1> for SrgbEncode {
         let [clamped, excess] = beyond(x, KNEE[0]);
         let line = x.like(SLOPE) * x;
         let power = x.like(1.0 + OFFSET) * clamped.pow(x.like(1.0 / EXPONENT)) - x.like(OFFSET);
-        // A NaN chooses the line, which it stays NaN on.
+        // NaN chooses the linear branch and stays NaN.
         excess.if_positive(power, line)
     }
     fn cases(&self, c: &mut Cases) {
@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_round_trip() {
+    fn srgb_codes_round_trip() {
         for code in 0..=255 {
             let code = f64::from(code) / 255.0;
             assert!((SrgbEncode.f([SrgbDecode.f([code])]) - code).abs() < 1e-6);

@@ -9,14 +9,16 @@ use image::{DynamicImage, ImageBuffer, ImageFormat, Luma};
 use std::io::Cursor;
 use std::path::Path;
 
-/// Reads depths along the optical axis, a PNG of integers or a `.npy` array of floats, in multiples of `unit` scene
-/// units. Returns distances along the rays through the camera's pixel centres, in scene units; 0 where nothing was
-/// measured. Other sizes are resampled by nearest neighbour: an average of a near and a far depth would be wrong.
+/// Reads depths along the optical axis in multiples of `unit` scene units: a PNG of integers or a `.npy` array of
+/// floats.
+///
+/// Returns distances along the rays through the camera's pixel centres, in scene units; 0 where nothing was measured.
+/// Other sizes are resampled by nearest neighbour: an average of a near and a far depth would be wrong.
 pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image> {
     let wrong = |what: String| Error::file(path, what);
     let ([width, height], depths) = decoded(path)?;
     let Camera { width: columns, height: rows, .. } = *camera;
-    // Up to the rounding of a side.
+    // The aspect ratios may differ by the rounding of a side.
     let apart = 2 * (width * rows).abs_diff(height * columns);
     if width == 0 || height == 0 || apart > (width + height).max(rows + columns) {
         return Err(wrong(format!(
@@ -36,7 +38,7 @@ pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image
     Ok(out)
 }
 
-/// The width and height of a file of depths, and what it holds, row by row.
+/// The width, height and row-major values of a depth file.
 fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
     let wrong = |what: String| Error::file(path, what);
     let bytes = std::fs::read(path).map_err(|error| Error::file(path, error))?;
@@ -60,7 +62,7 @@ fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Depths {
     size: [usize; 2],
-    /// Row by row.
+    /// Row-major.
     values: Vec<f32>,
 }
 
@@ -87,7 +89,7 @@ impl Depths {
         let along = |(pixel, distance): (usize, &f32)| {
             let [x, y] = camera.place_of(pixel);
             let depth = scale * f64::from(*distance) * camera.pixel_ray(x, y).direction.dot(axis);
-            // Behind the camera, which a wide lens sees, there is no depth.
+            // A wide lens also sees behind the camera, where depth is undefined.
             if depth > 0.0 { depth as f32 } else { 0.0 }
         };
         let values = distances.data.iter().enumerate().map(along).collect();
@@ -134,11 +136,11 @@ mod tests {
     use image::Rgb;
 
     #[test]
-    fn depth_files_come_back_as_written() {
+    fn depth_files_round_trip() {
         let folder = tempfile::tempdir().unwrap();
         let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::ZERO, DVec3::Z);
         let camera = Camera::from_angle(5, 3, 1.4, pose);
-        // A wall at depth 4.5, seen everywhere but at two pixels; another so far away that its number has no room.
+        // A wall at depth 4.5 with two unknown pixels; and one whose depth does not fit into 16 bits.
         let wall = |depth: f64| {
             let mut image = Image::new(5, 3, 1);
             for pixel in 0..15 {
@@ -172,7 +174,7 @@ mod tests {
     fn depths_become_distances_and_are_not_averaged() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("depth.png");
-        // Twice as large as the photograph: 0 is not known.
+        // Twice the size of the image; 0 is unknown.
         let values = [0_u16, 1000, 2000, 3000, 4000, 5000, 6000, 65535];
         let picture = ImageBuffer::<Luma<u16>, _>::from_fn(8, 4, |x, y| Luma([values[((x + 8 * y) / 4) as usize]]));
         picture.save(&path).unwrap();
@@ -215,7 +217,7 @@ mod tests {
         ImageBuffer::<Luma<u8>, _>::from_pixel(8, 4, Luma([200])).save(&path).unwrap();
         let found = distances(&path, 0.01, &wide).unwrap();
         assert!((0..32).any(behind) && (0..32).all(|i| (found.data[i] == 0.0) == behind(i)), "{found:?}");
-        // Both sides of a photograph that was made smaller are rounded.
+        // Downscaling rounded both sides of the image.
         ImageBuffer::<Luma<u8>, _>::new(1002, 753).save(&path).unwrap();
         distances(&path, 1.0, &Camera::from_angle(251, 188, 0.5, DAffine3::IDENTITY)).unwrap();
     }

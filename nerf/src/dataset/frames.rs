@@ -112,7 +112,7 @@ impl Dataset {
                 return ndc.pixels(camera, middle);
             }
             let distance = camera.pose.translation.distance(middle).max(0.5 * side);
-            // Of a panorama, a radian is so many pixels.
+            // The pixels per radian of a panorama.
             let focal = match camera.lens {
                 Lens::Equirectangular => camera.width as f64 / std::f64::consts::TAU,
                 _ => camera.focal[0].max(camera.focal[1]),
@@ -161,11 +161,11 @@ impl Dataset {
     /// # Errors
     /// If no ray of any image meets the box between `near` and `far`, so that nothing could be learned.
     pub fn check_reach(&self, bounds: [DVec3; 2]) -> Result<()> {
-        /// Rays that are tried along each side of an image, before all.
+        /// Rays along each side of an image in the first, coarse test.
         const RAYS: usize = 32;
         let meets = |camera: &Camera, rays: [usize; 2]| camera.meets(bounds, [self.near, self.far], rays);
         let some = self.frames.iter().any(|frame| meets(&frame.camera, [RAYS; 2]));
-        // A small box may lie between the rays.
+        // A small box may lie between the coarse rays.
         let found = AtomicBool::new(some);
         parallel::each_of(&self.frames, |_, Frame { camera, .. }| {
             if !found.load(Ordering::Relaxed) && meets(camera, [camera.width, camera.height]) {
@@ -208,7 +208,7 @@ mod tests {
         let mut data = ball(Split::Train, 8);
         data.frames.truncate(3);
         data.bounds = [DVec3::new(-1.0, -2.0, -1.0), DVec3::new(1.0, 2.0, 3.0)];
-        // The middle is one above the origin, the longest side 4.
+        // The centre is 1 above the origin; the longest side is 4.
         let camera = |distance: f64| {
             let pose = Camera::look_at(DVec3::new(0.0, 0.0, 1.0 + distance), DVec3::Z, DVec3::Y);
             Camera { focal: [90.0, 100.0], ..Camera::from_angle(75, 50, 0.8, pose) }
@@ -217,7 +217,7 @@ mod tests {
             frame.camera = camera(distance);
         }
         assert!((data.pixels_per_side() - 4.0 * 100.0 / 8.0).abs() < 1e-9, "{}", data.pixels_per_side());
-        // Inside, as from a side.
+        // From inside of the box as well.
         data.frames.iter_mut().for_each(|frame| frame.camera = camera(0.5));
         assert!((data.pixels_per_side() - 200.0).abs() < 1e-9, "{}", data.pixels_per_side());
         data.frames.iter_mut().for_each(|frame| frame.camera.lens = Lens::Equirectangular);

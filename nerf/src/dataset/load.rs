@@ -19,15 +19,15 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Without splits in the files, one image in this many is held out, from the first by name.
+/// Without splits in the files, every this many images by name, from the first, is held out.
 const HELD_OUT: usize = 8;
-/// Images that are read to decide whether the background is empty.
+/// Images that decide on an empty background.
 const LOOKED_AT: usize = 3;
-/// The transparent share of an image that counts as an empty background.
+/// The transparent share of an image from which its background counts as empty.
 const CLEAR: f64 = 0.05;
-/// The white share of the border of images that show an object before white.
+/// The white share of the border from which an image shows an object in front of white.
 const WHITE_BORDER: f64 = 0.98;
-/// How much of a pixel of a mask must be white for it to be used.
+/// The least mask value of a used pixel.
 pub(super) const WHITE: f32 = 0.99;
 
 /// Options of [`Capture::load`].
@@ -108,7 +108,7 @@ impl Capture {
         views.len() > 1 && views.iter().enumerate().all(|(number, view)| view.split == Some(split(number)))
     }
 
-    /// Whether no image is both trained and tested on.
+    /// Checks that no held-out image is also trained on.
     fn check_splits(&self) -> Result<()> {
         let train = self.present().filter(|view| view.split == Some(Split::Train));
         let trained: HashMap<&PathBuf, &View> = train.filter_map(|view| Some((view.image.as_ref()?, view))).collect();
@@ -161,19 +161,19 @@ impl Capture {
             alpha += usize::from(has_alpha);
             match Photo::open(path, None) {
                 Ok(photo) => {
-                    // A border that was left when photographs were straightened is no sign of an empty background.
+                    // A transparent border may be left by undistortion, so it is no sign of an empty background.
                     clear += usize::from(photo.transparent_share() > CLEAR);
                     white += usize::from(!has_alpha && photo.white_border() > WHITE_BORDER);
                 }
                 Err(error) if has_alpha => return Err(name(error)),
-                // Loading says it, if it is loaded.
+                // Loading reports the error.
                 Err(_) => {}
             }
         }
         let empty = match (2 * clear > total, white == total) {
             (true, _) => Some("images have a transparent background"),
             (_, true) => Some("images show an object before white"),
-            // That is how the format has objects.
+            // The Blender format stores objects with an alpha channel.
             _ if 2 * alpha > total && self.format == Format::Blender => Some("images have alpha"),
             _ => None,
         };
@@ -208,7 +208,7 @@ impl Capture {
             return Err(Error::field(&self.file, &first.field, what));
         }
         let present = evenly_spaced(present, reading.views);
-        // What headers tell is found out before anything is decoded.
+        // All headers are checked before any image is decoded.
         let plan = |i: usize| self.named(present[i], Plan::new(self, present[i], reading.downscale));
         let plans = parallel::collect(present.len(), plan);
         let plans = plans.into_iter().collect::<Result<Vec<_>>>()?;
@@ -240,9 +240,9 @@ impl Capture {
 struct Plan<'a> {
     view: &'a View,
     path: PathBuf,
-    /// The size of the file's pixels that the camera was measured for, at another scale.
+    /// The size of the file's pixels in the orientation of the camera.
     size: [usize; 2],
-    /// The size that it will have here.
+    /// The size after downscaling.
     to: [usize; 2],
 }
 
@@ -280,7 +280,7 @@ impl<'a> Plan<'a> {
     }
 }
 
-/// The size that an image has for a camera, which was measured before or after it was turned.
+/// The size of an image in the orientation of its camera: as stored, or as shown.
 pub(super) fn size_for(path: &Path, camera: &Camera) -> Result<[usize; 2]> {
     let [stored, shown] = Photo::size_of_file(path)?;
     [stored, shown].into_iter().find(|size| same_shape(*size, camera)).ok_or_else(|| {
@@ -290,18 +290,18 @@ pub(super) fn size_for(path: &Path, camera: &Camera) -> Result<[usize; 2]> {
     })
 }
 
-/// Reads an image as its camera has taken it.
+/// Reads an image in the orientation of its camera.
 pub(super) fn open(path: &Path, camera: &Camera) -> Result<Photo> {
     Photo::open(path, Some(size_for(path, camera)?))
 }
 
-/// The image in a folder of downscaled images, as `images_4` beside `images`, with the remaining factor; or the image
-/// itself.
+/// The image in a folder of downscaled images, such as `images_4` beside `images`, with the remaining factor; otherwise
+/// the image itself.
 fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize) {
     let inside = path.strip_prefix(folder).unwrap_or(Path::new(""));
     let mut parts = inside.components();
     let first = parts.next().and_then(|part| part.as_os_str().to_str()).unwrap_or("");
-    // Of a capture that has no others.
+    // The capture itself refers to downscaled images.
     if let Some(factor) = first.strip_prefix("images_").and_then(|factor| factor.parse::<usize>().ok()) {
         return (path.to_owned(), if factor > 0 { downscale.div_ceil(factor) } else { downscale });
     }
@@ -314,18 +314,18 @@ fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize
     found.map_or_else(|| (path.to_owned(), downscale), |path| (path, 1))
 }
 
-/// Whether an image of this size can have been taken by the camera, at another scale: up to the rounding of a side.
+/// Returns true if the aspect ratios of an image and a camera agree, up to the rounding of a side.
 pub(crate) fn same_shape([width, height]: [usize; 2], camera: &Camera) -> bool {
     if [width, height] == [camera.width, camera.height] {
         return true;
     }
     let [w, h] = [width as f64, height as f64];
     let [cw, ch] = [camera.width as f64, camera.height as f64];
-    // Half a pixel of the smaller of the two, at the scale of the larger.
+    // Half a pixel of the smaller size, at the scale of the larger.
     cw > 0.0 && ch > 0.0 && (w * ch - h * cw).abs() <= 0.51 * cw.max(ch).max(w).max(h)
 }
 
-/// Reads a mask (white where pixels are used) of an image of the size `of`, downscaled to the size `to`.
+/// Reads a mask (white for used pixels) of an image of the size `of`, downscaled to the size `to`.
 fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
     let mask = Photo::open(path, Some(of))?;
     let [width, height] = to;
@@ -341,12 +341,12 @@ fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
     Ok(Mask::new(width, height, |x, y| mask.pixel(x, y)[0] >= WHITE))
 }
 
-/// The pixels that a lens sees, found once per camera.
+/// The pixels that each lens sees, computed once per camera.
 #[derive(Default)]
 struct Lit(Mutex<Vec<(Camera, Option<Arc<Mask>>)>>);
 
 impl Lit {
-    /// `None` where light reaches all.
+    /// The mask of seen pixels; `None` if the lens sees all.
     fn of(&self, camera: &Camera) -> Option<Arc<Mask>> {
         if camera.lens == Lens::Pinhole {
             return None;
@@ -360,7 +360,7 @@ impl Lit {
         let reached = |x: usize, y: usize| here.sees(x as f64 + 0.5, y as f64 + 0.5);
         let sides = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
         let mut border = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]).chain(sides);
-        // A lens that reaches the border reaches all that is within.
+        // A lens that sees the whole border sees all pixels inside.
         let whole = border.all(|(x, y)| reached(x, y));
         let lit = (!whole).then(|| Arc::new(Mask::new(width, height, reached)));
         known.push((here, lit.clone()));

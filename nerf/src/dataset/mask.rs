@@ -7,9 +7,9 @@ use rand::{Rng, RngExt};
 pub struct Mask {
     width: usize,
     height: usize,
-    /// A bit for each pixel, row by row.
+    /// A bit per pixel, row-major.
     words: Vec<u64>,
-    /// For each word how many pixels before it are used.
+    /// For each word, the number of used pixels before it.
     before: Vec<u32>,
     used: usize,
 }
@@ -78,7 +78,7 @@ mod tests {
     use rand::rngs::StdRng;
 
     #[test]
-    fn used_pixels_alone_are_drawn_and_all_as_often() {
+    fn mask_draws_used_pixels_uniformly() {
         let mask = Mask::new(10, 7, |x, y| (x + y) % 3 == 0);
         assert_eq!((mask.used(), mask.size()), (24, [10, 7]));
         let (mut rng, mut counts) = (StdRng::seed_from_u64(1), vec![0; 70]);
@@ -96,7 +96,7 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "the mask has no used pixel")]
-    fn a_photograph_without_pixels_has_none_to_draw() {
+    fn empty_mask_has_no_pixel_to_draw() {
         Mask::new(3, 3, |_, _| false).draw(&mut StdRng::seed_from_u64(1));
     }
 }

@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn folders_of_no_known_format_are_named() {
+    fn unknown_formats_name_the_folder() {
         let folder = tempfile::tempdir().unwrap();
         let fails = |path: &Path, expected: &str| {
             let message = load(path, Split::Train, 1).unwrap_err().to_string();

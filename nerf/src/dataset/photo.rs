@@ -28,7 +28,7 @@ pub struct Photo {
     values: Values,
 }
 
-/// The values, row by row from the top.
+/// The row-major values.
 #[derive(Debug, Clone, PartialEq)]
 enum Values {
     Bytes(Vec<u8>),
@@ -110,9 +110,9 @@ impl Photo {
         if self.has_alpha() { clear.count() as f64 / (self.width * self.height).max(1) as f64 } else { 0.0 }
     }
 
-    /// How much of its border, one pixel wide, is white, up to what JPEG makes of it: 0 to 1.
+    /// The share of the one-pixel border that is white, up to JPEG errors: 0 to 1.
     pub(super) fn white_border(&self) -> f64 {
-        /// The least value of a channel.
+        /// The least value of a white channel.
         const WHITE: f32 = 0.97;
         let Photo { width, height, .. } = *self;
         let border = (0..width * height).map(|i| [i % width, i / width]);
@@ -216,7 +216,7 @@ impl Image {
     }
 }
 
-/// The size of an image that is turned.
+/// The size of an image after an orientation.
 fn turned_size([width, height]: [usize; 2], turn: Orientation) -> [usize; 2] {
     match turn {
         Orientation::Rotate90 | Orientation::Rotate270 | Orientation::Rotate90FlipH | Orientation::Rotate270FlipH => {
@@ -226,13 +226,13 @@ fn turned_size([width, height]: [usize; 2], turn: Orientation) -> [usize; 2] {
     }
 }
 
-/// More pixels than any camera has: a file that says so is damaged, and would take all memory.
+/// More pixels than any camera has. A file that claims more is damaged, and decoding it would exhaust memory.
 const MOST_PIXELS: usize = 1 << 28;
-/// The most bytes that a file is decoded to: so many for each of its own, and so many whatever its length. A PNG file
-/// of one bit and one colour comes to half of the former; a damaged header says anything.
+/// The most decoded bytes: so many per byte of the file, plus a constant. PNG files of one colour with one bit per
+/// pixel reach half of the former; damaged headers can claim any size.
 const MOST_BYTES: [u64; 2] = [1 << 14, 1 << 26];
 
-/// What decodes a file, and the size of its pixels as they are stored.
+/// The decoder of a file, and the stored size of its pixels.
 fn decoder(path: &Path) -> Result<(impl ImageDecoder, [usize; 2])> {
     let bad = |e: std::io::Error| Error::file(path, format!("cannot be read: {e}"));
     let file = File::open(path).map_err(bad)?;
@@ -240,7 +240,7 @@ fn decoder(path: &Path) -> Result<(impl ImageDecoder, [usize; 2])> {
     decoder_of(BufReader::new(file), length, path)
 }
 
-/// The same for what a file of `length` bytes holds.
+/// [`decoder`] for the contents of a file of `length` bytes.
 pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
     reader: R,
     length: u64,
@@ -268,10 +268,10 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
     Ok((decoder, size))
 }
 
-/// Whether the parts of a WebP file of that many bytes lie in it: what decodes it takes as much memory for one as its
-/// header says. The reader is at the beginning, before and after.
+/// Returns true if the chunks of a WebP file fit into `length` bytes: the decoder allocates as much memory as a chunk's
+/// header claims. The reader is at the start, before and after.
 fn chunks_fit(reader: &mut (impl Read + Seek), length: u64) -> std::io::Result<bool> {
-    // `RIFF`, the length of what follows, `WEBP`; then a name and a length before each part.
+    // `RIFF`, the length of the rest and `WEBP`; then chunks with a name and a length.
     let mut size = [0; 4];
     reader.seek(SeekFrom::Start(4))?;
     reader.read_exact(&mut size)?;
@@ -283,7 +283,7 @@ fn chunks_fit(reader: &mut (impl Read + Seek), length: u64) -> std::io::Result<b
         at += 8 + u64::from(u32::from_le_bytes(size)).next_multiple_of(2);
     }
     reader.rewind()?;
-    // The last part of an odd length may lack what fills it up.
+    // A last chunk of odd length may lack its padding byte.
     Ok(at <= length + 1)
 }
 

@@ -4,11 +4,11 @@ use super::{Dataset, Frame, Image, SceneTransform, SceneType, Split};
 use crate::camera::{Camera, Ndc, Ray};
 use glam::DVec3;
 
-/// Half of what cameras see across, in radians, and how far they stand from the middle.
+/// Half of the cameras' field of view, in radians, and their distance from the centre.
 const ANGLE: f64 = 0.35;
 const DISTANCE: f64 = 4.0;
 
-/// Cameras on a spiral over the upper half of a sphere around the middle, which they look at.
+/// Cameras on a spiral over the upper hemisphere around the centre, looking at it.
 pub(crate) fn cameras_around(count: usize, size: usize) -> Vec<Camera> {
     let camera = |i: usize| {
         let (azimuth, height) = (2.4 * i as f64, (i as f64 + 0.5) / count as f64);
@@ -18,7 +18,7 @@ pub(crate) fn cameras_around(count: usize, size: usize) -> Vec<Camera> {
     (0..count).map(camera).collect()
 }
 
-/// The ball in 60 square training images, 10 validation and 20 test images, without a background.
+/// The ball in 60 square training images, 10 validation images and 20 test images, without a background.
 pub(crate) fn ball(split: Split, size: usize) -> Dataset {
     let (count, skipped) = match split {
         Split::Train => (60, 0),
@@ -51,7 +51,7 @@ pub(crate) fn ball_ahead(size: usize) -> Dataset {
     Dataset { frames, near, far, scope: SceneType::ForwardFacing, ndc, ..ball(Split::Val, 1) }
 }
 
-/// What cameras see of it.
+/// Renders the ball for each camera.
 fn frames(cameras: impl Iterator<Item = Camera>) -> Vec<Frame> {
     let frame = |(i, camera): (usize, Camera)| {
         let mut image = Image::new(camera.width, camera.height, 4);
@@ -65,7 +65,7 @@ fn frames(cameras: impl Iterator<Item = Camera>) -> Vec<Frame> {
     cameras.enumerate().map(frame).collect()
 }
 
-/// The colour along a ray: stripes of two colours on the ball, brighter above.
+/// The colour along a ray: two-coloured stripes on the ball, brighter above.
 fn color(ray: &Ray) -> Option<[f32; 3]> {
     let along = -ray.origin.dot(ray.direction);
     let half = (1.0 - (ray.origin.length_squared() - along * along)).max(-1.0);

@@ -31,24 +31,22 @@ pub struct SceneAnalysis {
     pub reason: String,
 }
 
-/// Half of a box's side in scene units, as in the NeRF-synthetic scenes.
+/// Half of the box's side in scene units, as in the NeRF-synthetic scenes.
 const HALF_BOX: f64 = 1.5;
-/// Near and far of the NeRF-synthetic scenes: their files do not say where the scene lies, and all work on them uses
+/// Near and far of the NeRF-synthetic scenes. Their files do not give the scene's position, and all published work uses
 /// these.
 const CONVENTION: [f64; 2] = [2.0, 6.0];
-/// Where nothing else is known, a ray of an unbounded scene begins at this share of the cameras' distance from its
-/// middle.
+/// The default near plane of an unbounded scene, as a share of the cameras' distance from its centre.
 const NEAR_SHARE: f64 = 0.05;
-/// An unbounded scene's end, in sides of its box.
+/// The far plane of an unbounded scene, in sides of its box.
 const FAR_SIDES: f64 = 1000.0;
-/// Half of the box of an unbounded scene, as a share of the cameras' distance from its middle.
+/// Half of the box of an unbounded scene, as a share of the cameras' distance from its centre.
 const INNER_SHARE: f64 = 0.5;
-/// Where cameras look about nothing in common and nothing says how far they see: how much farther than they stand
-/// apart.
+/// The default distance of the scene for cameras that look the same way, in multiples of their spread.
 const AHEAD: f64 = 5.0;
-/// The same where they look all around.
+/// The same for cameras that look all around.
 const AROUND: f64 = 3.0;
-/// Times that the middle is found, the last ones without what is far off.
+/// Iterations of the reweighted least squares for the centre.
 const ROUNDS: usize = 8;
 
 impl SceneAnalysis {
@@ -74,7 +72,7 @@ impl SceneAnalysis {
             );
             return Err(Error::field(&capture.file, &first.field, what));
         }
-        // Opaque photographs show what lies behind, wherever their cameras stand.
+        // Opaque images show a background, wherever their cameras are.
         let bounded = asked.map_or(empty.is_some(), |scope| scope == SceneType::Bounded);
         if capture.format == Format::Blender && bounded && conventional(&cameras) {
             return Ok(SceneAnalysis {
@@ -149,7 +147,7 @@ impl Capture {
     }
 }
 
-/// Whether cameras stand around the origin as those of the NeRF-synthetic scenes, and look at it.
+/// Returns true if the cameras are around the origin like those of the NeRF-synthetic scenes, and look at it.
 fn conventional(cameras: &[&Camera]) -> bool {
     let [near, far] = CONVENTION;
     cameras.iter().all(|camera| {
@@ -159,18 +157,18 @@ fn conventional(cameras: &[&Camera]) -> bool {
     })
 }
 
-/// Where a scene lies for cameras that look at it, ahead or around.
+/// The position and size of the scene, from the cameras' arrangement.
 struct Layout {
     middle: DVec3,
     /// Half of the box of an unbounded scene.
     inner: f64,
-    /// How cameras look, in a few words.
+    /// A short description of the arrangement.
     looks: &'static str,
 }
 
 impl Layout {
-    /// `depths` are the nearest and farthest that each camera sees, if all are known, and `points` some of what they
-    /// see.
+    /// `depths` are the nearest and farthest depths of each camera, if all are known. `points` are a sample of the
+    /// visible points.
     fn new(cameras: &[&Camera], depths: &[[f64; 2]], points: &[DVec3]) -> Self {
         let distances = |middle: DVec3| median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
         if depths.len() == cameras.len() {
@@ -196,17 +194,17 @@ impl Layout {
     }
 }
 
-/// The middle of what cameras look at: the place nearest to their optical axes, in the sense of least squares. `None`
-/// where they do not look at one place, as in a room or along a wall.
+/// The centre of the cameras' views: the least-squares point nearest to their optical axes. `None` if they do not look
+/// at one place, as in a room or along a wall.
 fn middle(cameras: &[&Camera]) -> Option<DVec3> {
     let mean = average(cameras, |pose| pose.translation);
     let spread = cameras.iter().map(|camera| camera.pose.translation.distance(mean)).fold(0.0, f64::max);
     let mut weights = vec![1.0; cameras.len()];
     let mut found = mean;
-    // A camera that is lost is not to move it: the farther an axis passes, the less it counts.
+    // Outliers must not move the centre: weights fall with the distance of an axis.
     for _ in 0..ROUNDS {
         let (matrix, sum) = axes(cameras.iter().map(|camera| &camera.pose).zip(weights.iter().copied()), mean);
-        // Axes that are nearly parallel meet nowhere in particular.
+        // Nearly parallel axes have no well-defined intersection; damping keeps the solution near the cameras.
         let damping = DMat3::from_diagonal(DVec3::splat(1e-3 * weights.iter().sum::<f64>()));
         found = mean + (matrix + damping).inverse() * sum;
         let passes = passes_at(found);
@@ -216,31 +214,31 @@ fn middle(cameras: &[&Camera]) -> Option<DVec3> {
     let passes = passes_at(found);
     let ahead = |camera: &&&Camera| (found - camera.pose.translation).dot(-camera.pose.matrix3.z_axis) > 0.0;
     let most = 4 * cameras.iter().filter(ahead).count() > 3 * cameras.len();
-    // Axes come together there, and do not meet by chance, as nearly parallel ones do.
+    // The axes must converge there: nearly parallel ones may come close by chance.
     let together =
         2.0 * median(cameras.iter().map(&passes)) < median(cameras.iter().map(|c| c.pose.translation.distance(mean)));
     (most && together && found.is_finite() && found.distance(mean) < 100.0 * spread).then_some(found)
 }
 
-/// How far from a place the optical axis of a camera passes.
+/// The distance of a camera's optical axis from a point.
 fn passes_at(place: DVec3) -> impl Fn(&&Camera) -> f64 {
     move |camera| (across(&camera.pose) * (place - camera.pose.translation)).length()
 }
 
-/// The mean of what poses of cameras have.
+/// The mean of a property of the poses.
 fn average(cameras: &[&Camera], of: fn(&DAffine3) -> DVec3) -> DVec3 {
     mean(cameras.iter().map(|camera| of(&camera.pose)))
 }
 
-/// The middle of what lies ahead of cameras whose files say how near and far it is: halfway in inverse distance.
+/// The centre of the scene for cameras with known near and far depths: halfway in inverse depth along the axes.
 fn ahead(cameras: &[&Camera], depths: &[[f64; 2]]) -> DVec3 {
     mean(cameras.iter().zip(depths).map(|(camera, [near, far])| {
         camera.pose.translation - camera.pose.matrix3.z_axis * (2.0 / (1.0 / near + 1.0 / far))
     }))
 }
 
-/// A rotation after which up is along z: as people hold cameras level, up is what is across all of their horizontal
-/// axes (the least principal axis of these), on the side of their own up.
+/// A rotation that turns up to z. People hold cameras level, so up is perpendicular to the horizontal axes of all
+/// (their least principal axis), on the side of the cameras' up axes.
 fn upright(cameras: &[&Camera]) -> DMat3 {
     let mean = average(cameras, |pose| pose.matrix3.y_axis);
     let mut spread = DMat3::from_diagonal(DVec3::splat(1e-4));
@@ -255,15 +253,15 @@ fn upright(cameras: &[&Camera]) -> DMat3 {
     if !up.is_finite() {
         return DMat3::IDENTITY;
     }
-    // Of cameras that look straight down no side is up in their pictures: what they look away from is.
+    // Cameras that look straight down have no common up axis; the direction opposite to their views is up.
     let back = average(cameras, |pose| pose.matrix3.z_axis);
     let side = if up.dot(mean).abs() > 0.1 { up.dot(mean) } else { up.dot(back) };
     let up = if side < 0.0 { -up } else { up };
-    // The shortest way, so that a capture that is upright already is not turned.
+    // The shortest rotation leaves an upright capture unchanged.
     DMat3::from_quat(glam::DQuat::from_rotation_arc(up, DVec3::Z))
 }
 
-/// Half of the width of what cameras see at the middle of the scene.
+/// Half of the width of the cameras' views at the centre of the scene.
 fn half_width(cameras: &[&Camera], middle: DVec3) -> f64 {
     median(cameras.iter().map(|camera| {
         let [x, y] = [0, 1].map(|axis| {
@@ -274,21 +272,21 @@ fn half_width(cameras: &[&Camera], middle: DVec3) -> f64 {
     }))
 }
 
-/// Cameras and points that are asked: more would say the same.
+/// The most cameras and points that are used; more would not change the result.
 const ASKED: [usize; 2] = [64, 20_000];
-/// Points that say something together.
+/// The fewest points that are used.
 const FEWEST: usize = 100;
 
-/// Some of the points that can be trusted.
+/// A sample of the reliable points.
 fn trusted(points: &[Point]) -> Vec<DVec3> {
-    /// Photographs that a point must be seen in, and pixels that it may be off.
+    /// The fewest images and the largest reprojection error, in pixels, of a reliable point.
     const TRUSTED: (u32, f64) = (3, 2.0);
-    // Some files do not say in how many photographs a point is seen.
+    // Some files do not count the images of a point.
     let trusted = |p: &&Point| (p.views == 0 || p.views >= TRUSTED.0) && !(p.error > TRUSTED.1);
     evenly_spaced(points.iter().filter(trusted).map(|p| p.position).collect(), ASKED[1])
 }
 
-/// The distance of the nearest points from the cameras that see them; `None` if there are too few to trust.
+/// The distance of the nearest points from the cameras that see them; `None` if too few are reliable.
 fn nearest_point(cameras: &[&Camera], trusted: &[DVec3]) -> Option<f64> {
     if trusted.len() < FEWEST {
         return None;
@@ -297,7 +295,7 @@ fn nearest_point(cameras: &[&Camera], trusted: &[DVec3]) -> Option<f64> {
         let seen = trusted.iter().filter(|point| camera.shows(**point));
         let mut depths: Vec<f64> = seen.map(|point| point.distance(camera.pose.translation)).collect();
         depths.sort_by(f64::total_cmp);
-        // The nearest of two hundred: a few are always wrong.
+        // The nearest of every two hundred is skipped: a few are always wrong.
         depths.get(depths.len() / 200).copied()
     };
     let asked = evenly_spaced(cameras.to_vec(), ASKED[0]);

@@ -101,7 +101,7 @@ mod tests {
     fn similarity_is_found_from_noncollinear_points() {
         let rotation = DMat3::from_quat(DQuat::from_rotation_y(2.9) * DQuat::from_rotation_z(-1.0));
         let truth = SceneTransform { rotation, scale: 0.3, origin: DVec3::new(1.0, 2.0, -30.0) };
-        // In a plane, as cameras around an object are, and everywhere.
+        // In a plane, like cameras around an object, and in space.
         for height in [0.0, 1.0] {
             let point = |i: usize| {
                 let angle = i as f64;
@@ -112,7 +112,7 @@ mod tests {
             let found = SceneTransform::between(&from, &to).unwrap();
             assert!(from.iter().zip(&to).all(|(a, b)| found.point(*a).distance(*b) < 1e-12), "{found:?}");
             assert!((found.scale - 0.3).abs() < 1e-12 && found.rotation.abs_diff_eq(rotation, 1e-12));
-            // Of points that no similarity fits, the least squares: no small change is better.
+            // For points that no similarity fits, a least-squares solution: no small change improves it.
             to.iter_mut().enumerate().for_each(|(i, point)| point.x += 0.1 * (5.0 * i as f64).cos());
             let error = |placement: &SceneTransform| -> f64 {
                 from.iter().zip(&to).map(|(a, b)| placement.point(*a).distance_squared(*b)).sum()
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_see_the_same_in_either_coordinates() {
+    fn transformed_cameras_see_the_same() {
         let rotation = DMat3::from_quat(DQuat::from_rotation_x(0.3) * DQuat::from_rotation_z(2.0));
         let placement = SceneTransform { rotation, scale: 0.2, origin: DVec3::new(500_000.0, -3.0, 7.0) };
         placement.check().unwrap();

@@ -10,17 +10,18 @@ use crate::error::{Error, Result};
 use glam::DVec3;
 use std::f64::consts::PI;
 
-/// The widest view of a fisheye's pinhole, in radians: at its border a pixel is stretched 2.4 times already.
+/// The widest field of view of the pinhole for a fisheye, in radians: its border pixels are already stretched 2.4
+/// times.
 const WIDEST: f64 = 100.0 / 180.0 * PI;
-/// The farthest from the optical axis that anything is looked for, as a tangent.
+/// The tangent of the largest angle to the optical axis in the search.
 const FARTHEST: f64 = 8.0;
-/// Shapes of the picture that are tried, from a quarter of the width over the height to four times as much.
+/// Aspect ratios in the search, in each direction: up to 4 times as narrow or as wide.
 const SHAPES: i32 = 16;
-/// Places on a side of the picture that are looked at.
+/// Points tested along a side of the image.
 const PLACES: usize = 64;
-/// Halvings of a length, to a thousandth of a pixel.
+/// Bisections of a length, to a thousandth of a pixel.
 const HALVINGS: usize = 32;
-/// What a length of whole pixels may fall short by, in pixels.
+/// The error up to which a length counts as whole pixels, in pixels.
 const ROUNDING: f64 = 1e-4;
 
 impl Camera {
@@ -49,7 +50,7 @@ impl Camera {
             [scale * x, scale * y]
         });
         let best = halves.max_by(|a, b| (a[0] * a[1]).total_cmp(&(b[0] * b[1]))).unwrap_or_default();
-        // The shape was one of a few: what is left beside it is taken too.
+        // The best ratio is one of a few, so both sides are grown as far as possible.
         let x = last(best[0], |x| around([x, best[1]]));
         let best = [x, last(best[1], |y| around([x, y]))];
         let [width, height] = best.map(|half| (2.0 * half * focal + ROUNDING) as usize);
@@ -61,7 +62,7 @@ impl Camera {
     }
 }
 
-/// The largest number that is good, where all smaller ones from `low` on are.
+/// The largest number for which `good` holds, if it holds for all smaller ones from `low` on.
 fn last(mut low: f64, good: impl Fn(f64) -> bool) -> f64 {
     let mut high = FARTHEST.max(low);
     for _ in 0..HALVINGS {
@@ -71,8 +72,8 @@ fn last(mut low: f64, good: impl Fn(f64) -> bool) -> f64 {
     low
 }
 
-/// Whether a camera sees the rectangle of directions with these half sides. What it sees has no holes, so that its
-/// border tells.
+/// Returns true if a camera sees the rectangle of directions with these half sides. The visible region has no holes, so
+/// the border is enough.
 fn sees_all(camera: &Camera, [x, y]: [f64; 2]) -> bool {
     let most = match camera.lens {
         Lens::Fisheye { .. } | Lens::Fov { .. } => (0.5 * WIDEST).tan(),
@@ -90,7 +91,7 @@ fn sees_all(camera: &Camera, [x, y]: [f64; 2]) -> bool {
         let t = along(i);
         [(t * x, -y), (t * x, y), (-x, t * y), (x, t * y)].into_iter().all(|(a, b)| sees(a, b))
     };
-    // The corners are what fails first.
+    // The corners fail first.
     x <= most && y <= most && seen(0) && (0..=PLACES).all(seen)
 }
 
@@ -124,10 +125,10 @@ impl View {
     }
 }
 
-/// Where the camera `from` has what the pinhole camera `to` has at a pixel.
+/// The position in the camera `from` of a pixel of the pinhole camera `to`.
 fn place(to: &Camera, from: &Camera, pixel: [f64; 2]) -> [f64; 2] {
     let [x, y] = [0, 1].map(|axis| (pixel[axis] - to.centre[axis]) / to.focal[axis]);
-    // A pixel beside the picture may be seen by nobody: it is only asked how far pixels are apart.
+    // Positions beside the image are used only for the spacing of pixels; the lens may have none there.
     let place = from.lens.place(DVec3::new(x, y, 1.0)).unwrap_or([f64::NAN; 2]);
     [0, 1].map(|axis| place[axis] * from.focal[axis] + from.centre[axis])
 }

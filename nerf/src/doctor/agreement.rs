@@ -10,15 +10,15 @@ use super::poses::Focus;
 use glam::{DAffine3, DMat3, DVec3};
 use raygrad_tensor::parallel;
 
-/// Images that each one is compared with.
+/// The most neighbours that an image is compared with.
 const NEIGHBOURS: usize = 5;
 /// The angle between optical axes, in radians, beyond which images hardly match.
 const ANGLE: f64 = 0.8;
-/// How far beside the line of a patch the others lie, in pixels.
+/// Offsets of the compared lines from the epipolar line of a patch, in pixels.
 const BESIDE: [f64; 5] = [0.0, -16.0, -8.0, 8.0, 16.0];
-/// The cosine (normalised cross-correlation) from which patches are alike.
+/// The normalised cross-correlation above which patches match.
 const ALIKE: f32 = 0.8;
-/// Pixels between the places at which a patch is looked for, and the most places.
+/// Pixels between the positions of a search, and the most positions.
 const STEP: f64 = 1.3;
 const MOST_STEPS: f64 = 160.0;
 
@@ -29,7 +29,7 @@ pub(super) struct Placed<'a> {
     pub pose: DAffine3,
 }
 
-/// Counts of patches whose best match is on the epipolar line.
+/// Counts of patches with the best match on the epipolar line.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Tally {
     /// Patches with the best match there.
@@ -73,14 +73,14 @@ pub(super) fn compare(all: &[Placed<'_>], of: &[usize]) -> Vec<Pair> {
     let pairs: Vec<[usize; 2]> =
         of.iter().flat_map(|&i| neighbours(&poses, i, usual).into_iter().map(move |j| [i, j])).collect();
     let one = |&[i, j]: &[usize; 2]| {
-        // Nothing is nearer than a quarter of the way to what all look at.
+        // Nothing is assumed nearer than a quarter of the distance to the cameras' common focus.
         let nearest = focus.map_or(0.0, |focus| 0.25 * focus.place.distance(poses[i].translation));
         Pair { views: [i, j], tally: matched(all[i], all[j], nearest) }
     };
     parallel::collect(pairs.len(), |i| one(&pairs[i]))
 }
 
-/// The indices of the nearest images that look the same way, but not from the same place.
+/// The indices of the nearest images with similar directions but other positions.
 fn neighbours(poses: &[DAffine3], i: usize, usual: f64) -> Vec<usize> {
     let a = poses[i];
     let mut costs: Vec<(f64, usize)> = poses
@@ -97,7 +97,7 @@ fn neighbours(poses: &[DAffine3], i: usize, usual: f64) -> Vec<usize> {
     costs.into_iter().take(NEIGHBOURS).map(|(_, j)| j).collect()
 }
 
-/// From pixels of one picture and an inverse depth to pixels of another.
+/// Maps pixels of one image and inverse depths to pixels of another.
 struct Transfer<'a> {
     from: &'a Picture,
     to: &'a Picture,
@@ -106,8 +106,8 @@ struct Transfer<'a> {
 }
 
 impl Transfer<'_> {
-    /// Where the other picture shows what lies at the inverse depth `inverse` behind a pixel; `None` if behind its
-    /// camera.
+    /// The position in the other image of the point at the inverse depth `inverse` on a pixel's ray; `None` if it is
+    /// behind that camera.
     fn place(&self, [x, y]: [f64; 2], inverse: f64) -> Option<[f64; 2]> {
         let Picture { focal, centre, .. } = self.from;
         let direction = DVec3::new((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], 1.0);
@@ -116,7 +116,8 @@ impl Transfer<'_> {
         (point.z > 0.1).then(|| [point.x / point.z * focal[0] + centre[0], point.y / point.z * focal[1] + centre[1]])
     }
 
-    /// The same, and what a pixel to the right and one down become for a surface that faces the first camera.
+    /// The position, and the steps there for a pixel to the right and one down, on a surface that faces the first
+    /// camera.
     fn patch(&self, [x, y]: [f64; 2], inverse: f64) -> Option<([f64; 2], [[f64; 2]; 2])> {
         let place = self.place([x, y], inverse)?;
         let step = |other: [f64; 2]| [other[0] - place[0], other[1] - place[1]];
@@ -126,9 +127,9 @@ impl Transfer<'_> {
     }
 }
 
-/// Searches the patches of one image in another.
+/// Searches for the patches of one image in another.
 fn matched(a: Placed<'_>, b: Placed<'_>, nearest: f64) -> Tally {
-    // From the axes of OpenGL to those of images.
+    // From OpenGL's axes to those of images.
     let axes = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     let back = axes * b.pose.matrix3.transpose();
     let transfer = Transfer {
@@ -137,7 +138,7 @@ fn matched(a: Placed<'_>, b: Placed<'_>, nearest: f64) -> Tally {
         rotation: back * a.pose.matrix3 * axes,
         translation: back * (a.pose.translation - b.pose.translation),
     };
-    // What is nearer than about the distance between the cameras is not alike.
+    // Images of points nearer than about the distance between the cameras differ too much to match.
     let most = (1.2 / transfer.translation.length()).min(nearest.recip());
     let mut tally = Tally::default();
     for &corner in &a.picture.corners {
@@ -150,8 +151,9 @@ fn matched(a: Placed<'_>, b: Placed<'_>, nearest: f64) -> Tally {
     tally
 }
 
-/// Whether the line itself, and not one beside it, has the best match of a patch; `None` if none has a good one, or
-/// they are not of like length within the picture.
+/// Returns true if the epipolar line, and not a parallel one, has the best match of a patch.
+///
+/// `None` if no line has a good match, or if their lengths within the image differ too much.
 fn best_line(transfer: &Transfer<'_>, corner: [f64; 2], patch: &Patch, most: f64) -> Option<bool> {
     let start = transfer.place(corner, 0.0)?;
     let mut last = most;
@@ -184,7 +186,7 @@ fn best_line(transfer: &Transfer<'_>, corner: [f64; 2], patch: &Patch, most: f64
             }
         }
     }
-    // A line that is outside of the picture cannot win: nor must it lose.
+    // A line outside of the image cannot win, so it must not count as a loss.
     let longest = counts.into_iter().max()?;
     let fair = counts.iter().all(|count| 2 * count >= longest);
     let others = best[1..].iter().copied().fold(-1.0, f32::max);

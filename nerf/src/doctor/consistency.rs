@@ -9,21 +9,21 @@ use crate::dataset::{View, evenly_spaced};
 use crate::numbers::median;
 use std::collections::BTreeMap;
 
-/// Images that are compared with their neighbours under each convention.
+/// Images compared with their neighbours under each convention.
 const TRIED: usize = 12;
-/// Patches that must have a match before agreement counts.
+/// The fewest matched patches for a verdict.
 const ENOUGH: usize = 100;
-/// The same for a single image, and the standard deviations it must be from the others.
+/// The same for a single image, and its least distance from the others in standard deviations.
 const FEWEST: usize = 8;
 const DEVIATIONS: f64 = 4.0;
 /// The agreement of good cameras.
 const GOOD: f64 = 0.2;
-/// Below it, images and cameras do not match at all.
+/// Below this agreement, images and cameras do not match.
 const NONE: f64 = 0.06;
-/// A camera is wrong whose agreement is a smaller share of that of the others.
+/// An image is wrong if its agreement is below this share of the median.
 const WRONG: f64 = 0.35;
 
-/// Adds findings about agreement between images; returns the agreement, if enough patches match.
+/// Adds findings about agreement between images; returns the agreement if enough patches match.
 pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Findings) -> Option<f64> {
     let under = |convention: Convention| -> Vec<Placed<'_>> {
         all.iter().map(|(view, picture)| Placed { picture, pose: convention.apply(view.camera.pose) }).collect()
@@ -60,9 +60,9 @@ fn total(pairs: &[Pair]) -> Tally {
     total
 }
 
-/// Adds the finding that images match under another convention than the one that is read.
+/// Adds the finding that images match under another convention.
 fn another(convention: Convention, [own, other]: [f64; 2], findings: &mut Findings) {
-    // What poses alone made one think is settled.
+    // The images decide, so findings from poses alone are obsolete.
     findings.0.retain(|finding| {
         !matches!(finding.kind, Kind::LooksAway | Kind::OpenCvAxes | Kind::WorldToCamera | Kind::OnePlace)
     });
@@ -80,10 +80,10 @@ fn another(convention: Convention, [own, other]: [f64; 2], findings: &mut Findin
     }
 }
 
-/// The indices of images that do not match their neighbours, although these match each other.
+/// The indices of images that do not match their neighbours, although the neighbours match each other.
 fn wrong_poses(pairs: &[Pair]) -> Vec<usize> {
     let mut wrong: Vec<usize> = vec![];
-    // The worst first, and then without it: one wrong camera does not make those beside it wrong.
+    // Removes the worst first, since one wrong camera lowers the agreement of its neighbours.
     loop {
         let mut tallies: BTreeMap<usize, Tally> = BTreeMap::new();
         for pair in pairs.iter().filter(|pair| pair.views.iter().all(|view| !wrong.contains(view))) {
@@ -101,7 +101,7 @@ fn wrong_poses(pairs: &[Pair]) -> Vec<usize> {
     wrong
 }
 
-/// Whether an image matches significantly less than the others.
+/// Returns true if an image matches significantly less than the others.
 fn is_wrong(tally: Tally, usual: f64) -> bool {
     let (count, rate) = (tally.trials as f64, Tally::rate(usual));
     let deviation = (count * rate * (1.0 - rate)).sqrt();

@@ -10,20 +10,20 @@ use crate::numbers::{mean, median};
 use Severity::{Error, Warning};
 use glam::{DAffine3, DVec3};
 
-/// Fewer images than the first are an error, fewer than the second a warning.
+/// Fewer images than the first are an error; fewer than the second are a warning.
 const FEW: [usize; 2] = [5, 20];
-/// Cameras that are not farther apart than this share of their distance from the origin stand in one place.
+/// The largest spread of cameras in one place, as a share of their distance from the origin.
 const ONE_PLACE: f64 = 1e-9;
-/// Cameras whose second extent is a smaller share of the first stand on a line.
+/// The largest second extent of cameras on a line, as a share of the first.
 const LINE: f64 = 0.02;
-/// The cosine of half of the cone around the poles in which roll and azimuth say nothing.
+/// The cosine of half of the cone around the poles, in which roll and azimuth are meaningless.
 const POLE: f64 = 0.9;
-/// The angle in degrees that a camera may be turned about its optical axis.
+/// The largest rotation about the optical axis, in degrees.
 const ROLL: f64 = 30.0;
-/// The angle in degrees, as seen from the middle, that may be without a camera.
+/// The largest angle without a camera, seen from the centre, in degrees.
 const GAP: f64 = 120.0;
 
-/// Adds findings about the cameras that have images, as a whole.
+/// Adds findings about all cameras that have images.
 pub(super) fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &mut Findings) {
     let views: Vec<&View> = capture.present().collect();
     few(capture, &views, findings);
@@ -82,9 +82,9 @@ fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
     }
 }
 
-/// The convention, other than the one that is read, under which cameras have the points of the capture in their images.
+/// The convention, other than the one used, under which the capture's points are in the images.
 fn by_points(capture: &Capture, views: &[&View]) -> Option<(Convention, Severity)> {
-    /// Too few points; those that are looked at; cameras that are looked at.
+    /// The fewest points; the most points and cameras that are used.
     const COUNTS: [usize; 3] = [50, 200, 40];
     if capture.points.len() < COUNTS[0] {
         return None;
@@ -101,13 +101,13 @@ fn by_points(capture: &Capture, views: &[&View]) -> Option<(Convention, Severity
     if share(Convention::AsRead) > 0.05 {
         return None;
     }
-    // Mirrored cameras have mirrored points: these say nothing of mirrors.
+    // Mirrored captures mirror their points too, so points cannot reveal it.
     let others = [Convention::OpenCv, Convention::WorldToCamera, Convention::WorldToOpenCv].map(|c| (share(c), c));
     let (best, convention) = others.into_iter().max_by(|a, b| a.0.total_cmp(&b.0))?;
     (best > 0.2).then_some((convention, Error))
 }
 
-/// The convention that camera axes suggest. It is no proof: cameras inside a room look away from each other too.
+/// The convention that the camera axes suggest. It is not proven: cameras inside a room look away from each other too.
 fn by_axes(poses: &[DAffine3], focus: Option<Focus>, size: f64) -> Option<(Convention, Severity)> {
     if focus.is_some_and(|focus| focus.is_inward() && size > 1e-3 * focus.distance) {
         return None;
@@ -117,7 +117,7 @@ fn by_axes(poses: &[DAffine3], focus: Option<Focus>, size: f64) -> Option<(Conve
     for convention in [Convention::WorldToCamera, Convention::WorldToOpenCv] {
         let poses = under(convention);
         let places: Vec<DVec3> = poses.iter().map(|pose| pose.translation).collect();
-        // Sharper than elsewhere, and over a wide range of directions: what is inverted by mistake rarely meets so well.
+        // Sharper than otherwise and over a wide range of directions: wrongly inverted poses rarely converge so well.
         let fits = |focus: Focus| focus.is_inward() && focus.miss < 0.15 && extents(&places)[1] > 0.2 * focus.distance;
         if Focus::of(&poses).is_some_and(fits) && !focus.is_some_and(|focus| focus.miss < 0.3 && focus.ahead < 0.1) {
             return Some((convention, Warning));
@@ -127,9 +127,9 @@ fn by_axes(poses: &[DAffine3], focus: Option<Focus>, size: f64) -> Option<(Conve
     focus.is_some_and(away).then_some((Convention::OpenCv, Warning))
 }
 
-/// Images with the pose of another; each is named once, whatever the number of others.
+/// Adds findings about images with the pose of another. Each is named once, however many others there are.
 fn pairs(views: &[&View], places: &[DVec3], distance: f64, size: f64, findings: &mut Findings) {
-    /// How near poses are that are the same: as a share of a length, and in radians.
+    /// The tolerances of equal poses: a share of a length, and radians.
     const SAME: [f64; 2] = [1e-6, 1e-5];
     const NEARLY: [f64; 2] = [1e-3, 3e-3];
     let is_trained = |i: usize| views[i].split == Some(Split::Train);
@@ -161,7 +161,7 @@ fn far_cameras(views: &[&View], places: &[DVec3], size: f64, findings: &mut Find
 }
 
 fn scale(capture: &Capture, places: &[DVec3], size: f64, findings: &mut Findings) {
-    /// Shares of the distance of what is seen that cameras are apart.
+    /// Plausible spreads of the cameras, as shares of the distance to the scene.
     const PLAUSIBLE: [f64; 2] = [3e-3, 100.0];
     let mean = mean(places.iter().copied());
     if capture.points.len() >= 10 {
@@ -215,8 +215,8 @@ fn coverage(places: &[DVec3], focus: Focus, up: DVec3, findings: &mut Findings) 
 }
 
 fn in_the_box(views: &[&View], survey: &SceneAnalysis, findings: &mut Findings) {
-    /// Rays that are tried along each side of an image; the second where all of the first miss a box that may lie
-    /// between.
+    /// Rays along each side of an image; the second number applies if all of the first miss, since a small box may lie
+    /// between them.
     const RAYS: [usize; 2] = [12, 200];
     if survey.scene_type != SceneType::Bounded {
         return;

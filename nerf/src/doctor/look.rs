@@ -9,11 +9,11 @@ use raygrad_tensor::parallel;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Longest side of the images in which blur is looked for: smaller ones are sharp in any case.
+/// The longest side of the images whose blur is measured: smaller ones are always sharp.
 const LONGEST: usize = 800;
-/// Longest side of those that are compared with each other.
+/// The longest side of the images that are compared with each other.
 const SMALL: usize = 200;
-/// Brightness below which a pixel counts as this.
+/// The least luminance; darker pixels count as this.
 const DARK: f64 = 0.01;
 
 /// Measurements of an image.
@@ -34,7 +34,7 @@ pub(super) struct Look {
     pub picture: Option<Picture>,
 }
 
-/// Measures all images, in parallel, in the order of the views that have one.
+/// Measures all images in parallel; the results have the order of the views.
 pub(super) fn look_at_all<'a>(
     capture: &'a Capture,
     progress: &(dyn Fn(usize, usize) + Sync),
@@ -50,7 +50,7 @@ pub(super) fn look_at_all<'a>(
 
 fn look_at(view: &View) -> Result<Look> {
     let path = view.image.clone().unwrap_or_default();
-    // As it is stored if the camera was measured so, otherwise as it is shown.
+    // As stored if that fits the camera, otherwise as shown.
     let [stored, shown] = Photo::size_of_file(&path)?;
     let size = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera));
     let photo = Photo::open(&path, size)?;
@@ -70,7 +70,7 @@ fn look_at(view: &View) -> Result<Look> {
     Ok(Look { transparent, hash: hasher.finish(), sharpness, luminance, balance, used, picture })
 }
 
-/// Downsizes an image so that its longest side is at most this.
+/// Downsizes an image to a longest side of at most `longest`.
 fn shrunk(photo: &Photo, longest: usize) -> Photo {
     let Photo { width, height, .. } = *photo;
     let share = (longest as f64 / width.max(height) as f64).min(1.0);
@@ -96,7 +96,7 @@ fn variance(values: impl Iterator<Item = f64>) -> f64 {
     squares / count - (sum / count) * (sum / count)
 }
 
-/// The mean colour of what is there: put behind what is not, it makes no edge that changes with the exposure.
+/// The mean colour, weighted by alpha. Behind transparent pixels it makes no edge that depends on the exposure.
 fn mean(image: &Image) -> [f32; 3] {
     let (mut sum, mut weights) = ([0.0; 3], f32::MIN_POSITIVE);
     for pixel in image.data.chunks_exact(image.channels) {
@@ -107,7 +107,7 @@ fn mean(image: &Image) -> [f32; 3] {
     sum.map(|sum| sum / weights)
 }
 
-/// See [`Look::luminance`] and [`Look::balance`]: of linear light, weighted by alpha.
+/// See [`Look::luminance`] and [`Look::balance`]: both are of linear light, weighted by alpha.
 fn light(image: &Image) -> (Option<f64>, [f64; 2]) {
     let (mut weights, mut logs, mut means) = (0.0, 0.0, [0.0; 3]);
     for pixel in image.data.chunks_exact(image.channels) {

@@ -5,15 +5,15 @@ use crate::numbers::median;
 use glam::DVec3;
 use std::collections::HashMap;
 
-/// Places by the cell of a cubic lattice that they lie in. Memory and time are linear in their number.
+/// Points in the cells of a cubic lattice. Memory and time are linear in their number.
 pub(super) struct Nearby<'a> {
     places: &'a [DVec3],
-    /// Side of a cell, and the distance up to which places are near.
+    /// The side of a cell, and the radius of the search.
     radius: f64,
     cells: HashMap<[i64; 3], Vec<usize>>,
 }
 
-/// The most places that are looked at for one: where more of them are in one place, it is most likely to be among them.
+/// The most points tested for one query. In a crowded place the nearest is most likely among them.
 const LOOKED_AT: usize = 500;
 
 impl<'a> Nearby<'a> {
@@ -38,9 +38,9 @@ impl<'a> Nearby<'a> {
     }
 }
 
-/// The median distance of a place from its `away`-th nearest neighbour, over at most `ASKED` places.
+/// The median distance of a point from its `away`-th nearest neighbour, over at most `ASKED` points.
 pub(super) fn usual_gap(places: &[DVec3], away: usize) -> f64 {
-    /// The most places that are asked.
+    /// The most points in the median.
     const ASKED: usize = 500;
     median(evenly_spaced(places.to_vec(), ASKED).into_iter().map(|place| {
         let mut gaps: Vec<f64> = places.iter().map(|other| other.distance(place)).collect();
@@ -49,9 +49,9 @@ pub(super) fn usual_gap(places: &[DVec3], away: usize) -> f64 {
     }))
 }
 
-/// The cell that holds a place.
+/// The cell of a point.
 fn cell(place: DVec3, side: f64) -> [i64; 3] {
-    // Beyond 2^63 cells all are the last one.
+    // Casts saturate, so all points beyond 2^63 cells share the last one.
     (place / side).floor().to_array().map(|x| x as i64)
 }
 
@@ -62,11 +62,11 @@ mod tests {
     use rand_pcg::Pcg64Mcg;
 
     #[test]
-    fn nearby_finds_what_comparing_all_finds() {
+    fn nearby_equals_brute_force() {
         let mut rng = Pcg64Mcg::seed_from_u64(3);
         let mut places: Vec<DVec3> =
             (0..300).map(|_| DVec3::from_array(std::array::from_fn(|_| rng.random::<f64>() * 4.0 - 2.0))).collect();
-        // On the borders of cells, and at the same place.
+        // Points on the borders of cells, and coinciding points.
         places.extend([DVec3::ZERO, DVec3::X, -DVec3::X, DVec3::splat(0.5), DVec3::splat(0.5)]);
         for radius in [0.1, 0.5, 1.0] {
             let nearby = Nearby::new(&places, |i| i % 3 != 1, radius);
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn nearby_many_in_one_place_are_not_all_looked_at() {
+    fn nearby_limits_the_points_of_a_crowded_place() {
         let places = [vec![DVec3::ONE; 100_000], vec![DVec3::splat(1e300), DVec3::splat(-1e300)]].concat();
         let nearby = Nearby::new(&places, |_| true, 1e-6);
         assert!((0..places.len()).all(|i| (1..=LOOKED_AT).contains(&nearby.of(i).count())));

@@ -7,24 +7,23 @@ use crate::dataset::{Image, Photo};
 pub(super) const HALF: i32 = 3;
 /// Pixels in a patch.
 pub(super) const PATCH: usize = (2 * HALF as usize + 1).pow(2);
-/// Side of the squares of which each gives one patch at most.
+/// The side of the squares that give at most one patch each.
 const CELL: usize = 16;
-/// Patches of a picture at most.
+/// The most patches of an image.
 const PATCHES: usize = 36;
-/// Smallest contrast of a patch, as the root of the mean square of its steps from pixel to pixel across its weakest
-/// direction.
+/// The least contrast of a patch: the root mean square of its gradient in the weakest direction.
 const CONTRAST: f32 = 0.02;
 
-/// What transparent pixels are put over.
+/// The colour behind transparent pixels.
 const BEHIND: [f32; 3] = [0.5; 3];
 
-/// A grey image of a pinhole camera in the axes of images: x right, y down, z ahead.
+/// A grey image of a pinhole camera, in image axes: x right, y down, z ahead.
 pub(super) struct Picture {
     pub width: usize,
     pub height: usize,
     pub focal: [f64; 2],
     pub centre: [f64; 2],
-    /// Row by row; NaN where nothing is known.
+    /// Row-major; NaN for unknown pixels.
     values: Vec<f32>,
     /// Where there is something to recognise.
     pub corners: Vec<[f64; 2]>,
@@ -86,7 +85,7 @@ impl Picture {
             *value = self.at(x + u * across[0] + v * down[0], y + u * across[1] + v * down[1]);
             sum += *value;
         }
-        // One value that is not known makes the sum unknown.
+        // One NaN makes the sum NaN.
         let mean = sum / PATCH as f32;
         let length = patch.iter().map(|value| (value - mean) * (value - mean)).sum::<f32>().sqrt();
         if !(length > 0.005 * (PATCH as f32).sqrt()) {
@@ -96,8 +95,8 @@ impl Picture {
         Some(patch)
     }
 
-    /// In each cell the place that moves most in whatever direction the image is shifted (Shi and Tomasi 1994), the
-    /// best first.
+    /// Corners (Shi and Tomasi 1994): in each cell the position with the largest change under a shift in its weakest
+    /// direction, the best first.
     fn find_corners(&self) -> Vec<[f64; 2]> {
         let border = HALF as usize + 2;
         if self.width <= 2 * border + 1 || self.height <= 2 * border + 1 {
@@ -128,14 +127,14 @@ impl Picture {
     }
 }
 
-/// Brightness, one value a pixel, in the curve of the file: what eyes see as even steps.
+/// Brightness, one value per pixel, in the file's transfer curve, which is perceptually even.
 pub(super) fn grey(photo: &Photo, behind: [f32; 3]) -> Image {
     let image = photo.over(behind);
     let data = image.data.chunks_exact(3).map(|rgb| 0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]).collect();
     Image { channels: 1, data, ..image }
 }
 
-/// Makes unknown what a mask does not use.
+/// Sets pixels that a mask does not use to unknown.
 fn hide(image: &mut Image, mask: &Photo) {
     let Image { width, height, .. } = *image;
     for (i, value) in image.data.iter_mut().enumerate() {

@@ -15,17 +15,17 @@ pub(super) struct Seen<'a> {
     pub look: &'a Look,
 }
 
-/// How many usual deviations an outlier is from the others.
+/// The least distance of an outlier from the others, in robust standard deviations.
 const FAR: f64 = 5.0;
-/// The smallest ratios that are reported: of edge contrast, of brightness, and of colour balance.
+/// The smallest reported ratios of edge contrast, brightness and colour balance.
 const BLUR: f64 = 4.0;
 const BRIGHTNESS: f64 = 1.5;
 const COLOUR: f64 = 1.2;
-/// Neighbours that an image is compared with, and how far before and after it in the file they may be.
+/// The neighbours that an image is compared with, and the range of the search before and after it in the file.
 const NEIGHBOURS: usize = 6;
 const AROUND: usize = 1000;
 
-/// The sizes of the images, from the headers of their files, the most frequent first.
+/// The sizes of the images, from their headers, the most frequent first.
 pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 2], usize)> {
     let mut counts: HashMap<[usize; 2], usize> = HashMap::new();
     let (mut shapes, mut first) = (vec![], String::new());
@@ -71,7 +71,7 @@ fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
     let mut first: HashMap<u64, &View> = HashMap::new();
     let (mut same, mut leaks) = (vec![], vec![]);
     for Seen { view, look } in seen {
-        // Images of one colour are all alike.
+        // All images of one colour are equal.
         if look.sharpness.is_none() {
             continue;
         }
@@ -88,7 +88,7 @@ fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
     }
 }
 
-/// The difference of each value from the median of its neighbours: a value that all neighbours share is no fault.
+/// The difference of each value from the median of its neighbours. A value that all neighbours share is not a fault.
 fn residuals(seen: &[Seen<'_>], value: impl Fn(&Look) -> Option<f64>) -> Vec<Option<f64>> {
     let values: Vec<Option<f64>> = seen.iter().map(|one| value(one.look)).collect();
     let pose = |i: usize| seen[i].view.camera.pose;
@@ -96,7 +96,7 @@ fn residuals(seen: &[Seen<'_>], value: impl Fn(&Look) -> Option<f64>) -> Vec<Opt
     let usual = median((0..seen.len()).map(|i| gap(i, 0))).max(f64::MIN_POSITIVE);
     let residual = |i: usize| {
         let own = values[i]?;
-        // The nearest so far, the nearest first.
+        // The nearest so far, in order of distance.
         let mut others: Vec<(f64, f64)> = vec![];
         for j in (i.saturating_sub(AROUND)..seen.len().min(i + AROUND)).filter(|j| *j != i) {
             let Some(value) = values[j] else { continue };
@@ -196,7 +196,7 @@ mod tests {
             let usual = median((0..count).map(|i| gap(i, 0)));
             let found = residuals(&seen, |look| look.sharpness);
             for i in (0..count).step_by(count.div_ceil(60)) {
-                // All that stand not too far away in the file, in order.
+                // All images in the range of the search, in order.
                 let mut others: Vec<(f64, f64)> = (0..count)
                     .filter(|j| *j != i && i.saturating_sub(AROUND) <= *j && *j < i + AROUND)
                     .filter_map(|j| {

@@ -4,18 +4,18 @@ use crate::camera::axes::axes;
 use crate::numbers::{eigen, mean, median, outer};
 use glam::{DAffine3, DMat3, DVec3};
 
-/// A convention that the matrices of a capture may follow.
+/// A possible convention of a capture's matrices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Convention {
-    /// As they are read: from the camera to the world, and the camera looks along its -z with y up (OpenGL).
+    /// As read: camera-to-world, where the camera looks along its -z with y up (OpenGL).
     AsRead,
     /// The camera looks along its +z with y down (OpenCV).
     OpenCv,
-    /// From the world to the camera.
+    /// World-to-camera.
     WorldToCamera,
-    /// From the world to the camera, which looks along its +z with y down: as COLMAP stores them.
+    /// World-to-camera, where the camera looks along its +z with y down, as COLMAP stores them.
     WorldToOpenCv,
-    /// The world is mirrored, and so are the cameras, from side to side.
+    /// The world and the cameras are mirrored from side to side.
     Mirrored,
     /// The same, and the cameras are upside down.
     MirroredUpsideDown,
@@ -59,7 +59,7 @@ impl Convention {
     }
 }
 
-/// The point that cameras look at.
+/// The point that the cameras look at.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Focus {
     /// The place nearest to all optical axes, in the sense of least squares.
@@ -78,7 +78,7 @@ impl Focus {
         let count = poses.len() as f64;
         let mean = mean(poses.iter().map(|pose| pose.translation));
         let (matrix, sum) = axes(poses.iter().map(|pose| (pose, 1.0)), mean);
-        // Directions that differ by less than about 3 degrees meet nowhere in particular.
+        // Axes that differ by less than about 3 degrees have no well-defined intersection.
         if poses.len() < 2 || !(matrix.determinant() > 1e-3 * count.powi(3)) {
             return None;
         }
@@ -96,8 +96,7 @@ impl Focus {
     }
 }
 
-/// How far places are from one another: the root of the mean square of their distance from their mean, along the
-/// principal axes, the greatest first.
+/// The root mean square distances of points from their mean along the principal axes, the largest first.
 pub(super) fn extents(places: &[DVec3]) -> [f64; 3] {
     let mean = mean(places.iter().copied());
     let mut scatter = DMat3::ZERO;
@@ -112,7 +111,7 @@ mod tests {
     use crate::dataset::sample::cameras_around;
 
     #[test]
-    fn conventions_are_undone_by_themselves() {
+    fn conventions_are_their_own_inverse() {
         let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::new(0.3, -0.2, 0.1), DVec3::Z);
         let undo = |convention: Convention| match convention {
             Convention::WorldToOpenCv => {

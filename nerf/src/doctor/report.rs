@@ -124,7 +124,7 @@ impl Report {
     }
 }
 
-/// Findings while they are made.
+/// Collects findings.
 #[derive(Debug, Default)]
 pub(super) struct Findings(pub Vec<Finding>);
 

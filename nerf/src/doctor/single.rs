@@ -5,19 +5,18 @@ use super::report::Findings;
 use crate::camera::{Camera, Lens};
 use crate::dataset::Capture;
 
-/// Fields of view that lenses have, in degrees, and those of lenses that show half of the world and more.
+/// Plausible fields of view in degrees, and the largest of fisheye lenses.
 const VIEWS: [f64; 2] = [10.0, 150.0];
 const WIDE: f64 = 230.0;
-/// Most that horizontal and vertical focal length differ in a camera with square pixels.
+/// The largest relative difference of horizontal and vertical focal length with square pixels.
 const ASPECT: f64 = 0.05;
-/// Most that the principal point is from the middle, in sides of the image.
+/// The largest distance of the principal point from the middle, in sides of the image.
 const OFF_CENTRE: f64 = 0.1;
-/// A lens that bends light by more degrees than this at some border is a strong one.
+/// The distortion at the border, in degrees, above which a lens is reported as strong.
 const BENDS: f64 = 5.0;
-/// Places along a line from the principal point to the border at which a lens is asked.
+/// Points tested along a line from the principal point to the border.
 const STEPS: usize = 32;
 
-/// Adds findings about single cameras.
 pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
     let mut about = |kind: Kind, wrong: &dyn Fn(&Camera) -> bool| {
         let sized = capture.views.iter().filter(|view| view.camera.width > 0 && view.camera.height > 0);
@@ -40,19 +39,19 @@ pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
     about(Kind::StrongDistortion, &|camera| reaches(camera) && bends(camera) > BENDS);
 }
 
-/// The horizontal (`axis` 0) or vertical field of view in degrees, distortion aside.
+/// The horizontal (`axis` 0) or vertical field of view in degrees, without distortion.
 pub(super) fn field_of_view(camera: &Camera, axis: usize) -> f64 {
     let size = [camera.width, camera.height][axis] as f64;
     let half = 0.5 * size / camera.focal[axis];
     let radians = match camera.lens {
-        // Places are angles, or nearly so.
+        // Image-plane positions are angles, at least nearly.
         Lens::Fisheye { .. } | Lens::Equirectangular | Lens::Fov { .. } => 2.0 * half,
         Lens::Pinhole | Lens::Brown { .. } => 2.0 * half.atan(),
     };
     radians.to_degrees()
 }
 
-/// Corners of the image and the middles of its sides, as places in the image plane.
+/// The corners of the image and the middles of its sides, in the image plane.
 fn border(camera: &Camera) -> impl Iterator<Item = [f64; 2]> {
     let [width, height] = [camera.width as f64, camera.height as f64];
     let [cx, cy] = camera.centre;
@@ -61,7 +60,8 @@ fn border(camera: &Camera) -> impl Iterator<Item = [f64; 2]> {
     ends(width).into_iter().flat_map(move |x| ends(height).map(move |y| [(x - cx) / fx, (y - cy) / fy]))
 }
 
-/// Whether light reaches all of the image, and from farther off the axis the farther from the principal point.
+/// Returns true if the lens sees all of the image, and the angle to the axis grows with the distance from the principal
+/// point.
 fn reaches(camera: &Camera) -> bool {
     if matches!(camera.lens, Lens::Pinhole | Lens::Equirectangular) {
         return true;
@@ -79,7 +79,7 @@ fn reaches(camera: &Camera) -> bool {
     })
 }
 
-/// The most degrees between the direction that light comes from at the border and that without distortion.
+/// The largest angle at the border, in degrees, between the lens's direction and that of a pinhole.
 fn bends(camera: &Camera) -> f64 {
     if !matches!(camera.lens, Lens::Brown { .. }) {
         return 0.0;
@@ -91,7 +91,7 @@ fn bends(camera: &Camera) -> f64 {
     angles.fold(0.0, f64::max).to_degrees()
 }
 
-/// A lens and its coefficients, without those that are 0 at the end.
+/// A lens and its coefficients, without trailing zeros.
 pub(super) fn described(lens: &Lens) -> String {
     let listed = |name: &str, values: &[f64]| {
         let used = values.iter().rposition(|x| *x != 0.0).map_or(0, |last| last + 1);

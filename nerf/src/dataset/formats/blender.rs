@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// Relative tolerance within which cameras' numbers count as equal.
+/// Relative tolerance for equal numbers of cameras.
 const SAME: f64 = 1e-9;
 
 /// The file that describes a split.
@@ -27,7 +27,7 @@ fn name_of(split: Split) -> String {
     format!("transforms_{split}.json")
 }
 
-/// Whether the folder holds a file of this format.
+/// Returns true if the folder contains a file of this format.
 pub(crate) fn detect(folder: &Path) -> bool {
     Split::ALL.into_iter().any(|split| file_of(folder, split).is_file())
 }
@@ -98,7 +98,7 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Why a view has no place in the format beside the first, if it has none.
+/// The reason that the format cannot hold a view, or cannot hold it together with the first; `None` if it can.
 fn unfit(view: &View, first: &View) -> Option<String> {
     let near = |a: f64, b: f64| (a - b).abs() <= SAME * b.abs();
     let camera = &view.camera;
@@ -129,7 +129,7 @@ fn unfit(view: &View, first: &View) -> Option<String> {
 
 fn frame(view: &View) -> Value {
     let path = paths::written(&view.name, view.image.as_deref());
-    // Programs for this format put the ending behind the path.
+    // Programs for this format append the extension to the path.
     let path = path.strip_suffix(".png").unwrap_or(&path);
     let prefix = if Path::new(path).is_absolute() { "" } else { "./" };
     json!({ "file_path": format!("{prefix}{path}"), "transform_matrix": matrix::to_json(view.camera.pose, 4) })

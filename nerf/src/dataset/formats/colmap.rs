@@ -26,10 +26,10 @@ use table::Table;
 
 pub use encoding::Encoding;
 
-/// Where a model may be in the folder of a capture, in the order in which they are looked at.
+/// Possible folders of a model within a capture, in the order of the search.
 const PLACES: [&str; 4] = ["sparse/0", "sparse", "", "colmap/sparse/0"];
 
-/// The folder of the model of a capture, and how it is written.
+/// The folder and the encoding of a capture's model.
 fn find(folder: &Path) -> Option<(PathBuf, Encoding)> {
     let folders = PLACES.iter().map(|place| if place.is_empty() { folder.to_owned() } else { folder.join(place) });
     let all = folders.flat_map(|folder| Encoding::ALL.map(|encoding| (folder.clone(), encoding)));
@@ -39,7 +39,7 @@ fn find(folder: &Path) -> Option<(PathBuf, Encoding)> {
     })
 }
 
-/// Whether the folder holds cameras in this format.
+/// Returns true if the folder contains cameras in this format.
 pub(crate) fn detect(folder: &Path) -> bool {
     find(folder).is_some()
 }
@@ -57,7 +57,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
     let files = encoding.files(&model);
     let content = |file: &Path| std::fs::read(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")));
     let [cameras, images, points] = &files;
-    // A model without points is one of known cameras.
+    // Models with known cameras may have no points.
     let points = if points.is_file() { Some(content(points)?) } else { None };
     let mut capture = parse(folder, encoding, &files, [&content(cameras)?, &content(images)?], points.as_deref())?;
     beside::attach(&mut capture, &model);
@@ -88,7 +88,7 @@ pub fn write(capture: &Capture, folder: &Path, encoding: Encoding) -> Result<()>
     encoding.files(&folder).iter().zip(bytes).try_for_each(|(file, bytes)| write_atomic(file, &bytes))
 }
 
-/// What the bytes of the files say. Nothing else is read.
+/// Parses the contents of the files, without reading any other file.
 fn parse(
     folder: &Path,
     encoding: Encoding,
@@ -128,7 +128,7 @@ fn parse(
     Ok(Capture { points, points_file, ..capture })
 }
 
-/// That no two entries of a list have the same key.
+/// Checks that no two entries of a list have the same key.
 fn distinct<K: Eq + std::hash::Hash + std::fmt::Display>(
     file: &Path,
     member: &str,

@@ -9,19 +9,19 @@ use crate::dataset::photo::Photo;
 use crate::error::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// The length of a unit of integer depth images, as nerfstudio has it: a millimetre where scenes are in metres.
+/// The unit of integer depth images in nerfstudio: a millimetre in scenes in metres.
 const DEPTH_UNIT: f64 = 1e-3;
 
-/// Which programs a file is for.
+/// The programs that a file is for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Dialect {
-    /// instant-ngp's and nerfstudio's. Images that no size is given for may differ.
+    /// instant-ngp and nerfstudio. Images may differ in size unless the file gives one.
     Transforms,
-    /// Blender's: all images are of one size, and `camera_angle_y` is not that of the images.
+    /// Blender. All images have one size, and `camera_angle_y` is not that of the images.
     Blender,
 }
 
-/// All frames, in the order of the file. No image is decoded; headers are read where the file gives no size.
+/// All frames, in the order of the file. No image is decoded; headers are read if the file gives no size.
 pub(super) fn views(top: &Object<'_>, folder: &Path, dialect: Dialect) -> Result<Vec<View>> {
     check_known(top)?;
     let frames = top.frames()?;
@@ -38,7 +38,7 @@ pub(super) fn views(top: &Object<'_>, folder: &Path, dialect: Dialect) -> Result
         check_known(frame)?;
         let pose = matrix::pose(frame, "transform_matrix")?;
         let header = || {
-            // An absent image is as large as the first, as far as anybody can say.
+            // An absent image is assumed to be as large as the first.
             let own = image.as_deref().filter(|_| dialect == Dialect::Transforms).map(|image| (frame, image));
             match (own, first) {
                 (Some(own), _) => size(own),
@@ -66,7 +66,7 @@ fn size((frame, image): (&Object<'_>, &Path)) -> Result<[usize; 2]> {
     })
 }
 
-/// A file that belongs to an image, which must be there if the image is.
+/// A file that accompanies an image. It must exist if the image does.
 fn beside(frame: &Object<'_>, folder: &Path, name: &str, needed: bool) -> Result<Option<PathBuf>> {
     let Some(value) = frame.get(name) else { return Ok(None) };
     let path = paths::normal(frame, name, value)?;
@@ -80,13 +80,13 @@ fn beside(frame: &Object<'_>, folder: &Path, name: &str, needed: bool) -> Result
     }
 }
 
-/// A file of depths with its unit: nerfstudio's `depth_file_path`, or instant-ngp's `depth_path`, which is only used
-/// with an `integer_depth_scale`.
+/// The depth file and its unit: nerfstudio's `depth_file_path`, or instant-ngp's `depth_path`, which needs an
+/// `integer_depth_scale`.
 fn depth(top: &Object<'_>, frame: &Object<'_>, folder: &Path, needed: bool) -> Result<Option<(PathBuf, f64)>> {
     let layers = Layers { top, frame };
     let unit = layers.find("depth_unit_scale_factor", |object, name| object.positive(name))?;
     if let Some(path) = beside(frame, folder, "depth_file_path", needed)? {
-        // Arrays of floats are in the units of the scene already.
+        // Float arrays are in scene units.
         let floats = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npy"));
         let default = if floats { 1.0 } else { DEPTH_UNIT };
         return Ok(Some((path, unit.unwrap_or(default))));

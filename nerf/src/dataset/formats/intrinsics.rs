@@ -10,7 +10,7 @@ use glam::DAffine3;
 use serde_json::{Map, Value};
 use std::f64::consts::PI;
 
-/// Camera fields of instant-ngp and nerfstudio that are not supported. Ignoring them silently would spoil every image.
+/// Unsupported camera fields of instant-ngp and nerfstudio. Ignoring them silently would spoil every image.
 const NOT_READ: [&str; 14] = [
     "x_fov",
     "y_fov",
@@ -28,16 +28,18 @@ const NOT_READ: [&str; 14] = [
     "transform_matrix_end",
 ];
 
-/// Lengths in pixels that a camera may have.
+/// Ranges of a camera's lengths in pixels.
 const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e9;
 const CENTRE: f64 = 1e9;
 const SIDE: f64 = 1048576.0;
 
-/// How far a field may be from what a panorama must have, as a share of it.
+/// The relative tolerance of a panorama's fields.
 const PANORAMA: f64 = 0.01;
 
+/// Checks that an object has no unsupported camera field, unless its value has no effect.
+///
 /// # Errors
-/// If the object has a field of a camera that is not read here, unless its value does nothing.
+/// If it has one.
 pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     fn nothing(value: &Value) -> bool {
         match value {
@@ -63,7 +65,7 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
 }
 
 impl Layers<'_, '_> {
-    /// A number of pixels.
+    /// Reads a side of the image, in pixels.
     fn side(&self, name: &str) -> Result<Option<usize>> {
         match self.number(name)? {
             Some(x) if !((1.0..=SIDE).contains(&x) && x.fract() == 0.0) => {
@@ -73,7 +75,7 @@ impl Layers<'_, '_> {
         }
     }
 
-    /// Width and height, if the file says.
+    /// The width and height, if the file gives them.
     fn size(&self) -> Result<Option<[usize; 2]>> {
         match (self.side("w")?, self.side("h")?) {
             (Some(w), Some(h)) => Ok(Some([w, h])),
@@ -83,8 +85,10 @@ impl Layers<'_, '_> {
         }
     }
 
-    /// The camera at `pose`. `header` reads the image size where the file gives none, and returns zeros without an
-    /// image. `angle_y`: whether `camera_angle_y` is that of the image; Blender's is that of its sensor.
+    /// The camera at `pose`.
+    ///
+    /// `header` reads the image size if the file gives none, and returns zeros without an image. `angle_y` is true if
+    /// `camera_angle_y` is that of the image; Blender's is that of its sensor.
     pub(super) fn camera(
         &self,
         pose: DAffine3,
@@ -109,7 +113,7 @@ impl Layers<'_, '_> {
         Ok(Camera { width, height, focal, centre, lens, pose })
     }
 
-    /// Focal lengths: those of the frame if it has any, otherwise the file's. One alone counts for both, as in
+    /// The focal lengths of the frame or, if it has none, of the file. A single one counts for both axes, as in
     /// instant-ngp.
     fn focal(&self, size: [usize; 2], angle_y: bool) -> Result<[f64; 2]> {
         let [top, frame] = [focal_of(self.top, size, angle_y)?, focal_of(self.frame, size, angle_y)?];
@@ -120,7 +124,7 @@ impl Layers<'_, '_> {
                 let what = "is missing: give the horizontal field of view in radians, or focal lengths in pixels as fl_x and fl_y";
                 Err(self.top.error("camera_angle_x", what))
             }
-            // Whether the other is to be the file's or the frame's no two programs agree on.
+            // Programs disagree on the other one: the file's, or the frame's for both axes.
             ([x, _], [Some(a), Some(b)]) if a != b => {
                 let [given, missing] = if x.is_some() { ["fl_x", "fl_y"] } else { ["fl_y", "fl_x"] };
                 let what = format!(
@@ -132,11 +136,11 @@ impl Layers<'_, '_> {
         }
     }
 
-    /// Focal lengths of a panorama of all directions, in pixels for each radian.
+    /// The focal lengths of a panorama of all directions, in pixels per radian.
     fn panorama(&self, [width, height]: [usize; 2]) -> Result<[f64; 2]> {
         let [w, h] = [width as f64, height as f64];
         let focal = [w / (2.0 * PI), h / PI];
-        // nerfstudio has its focal lengths in pixels for each half turn.
+        // nerfstudio's are in pixels per half turn.
         let rules: [(&str, [f64; 2], f64); 6] = [
             ("fl_x", [focal[0], 0.5 * w], 0.0),
             ("fl_y", [focal[1], h], 0.0),
@@ -156,7 +160,7 @@ impl Layers<'_, '_> {
     }
 }
 
-/// The focal lengths that one object gives: `fl_x` and `fl_y`, in whose place the angles stand.
+/// The focal lengths that one object gives: `fl_x` and `fl_y`, or else the angles.
 fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Option<f64>; 2]> {
     let axis = |length: &str, angle: &str, side: usize| {
         if let Some(f) = object.number(length)? {
@@ -178,10 +182,10 @@ fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Opt
     Ok([axis("fl_x", "camera_angle_x", size[0])?, axis("fl_y", "camera_angle_y", size[1])?])
 }
 
-/// Writes everything that a camera has but its pose, for a `model` of this name.
+/// Writes everything of a camera except its pose, for the model `model`.
 pub(super) fn write(camera: &Camera, model: &str, out: &mut Map<String, Value>) {
     let Camera { width, height, focal, centre, lens, .. } = camera;
-    // A panorama's are nerfstudio's, in pixels for each half turn.
+    // nerfstudio's focal lengths of a panorama are in pixels per half turn.
     let focal = match lens {
         Lens::Equirectangular => [0.5 * *width as f64, *height as f64],
         _ => *focal,

@@ -5,7 +5,7 @@ use crate::files::write_atomic;
 use serde_json::{Map, Value};
 use std::path::Path;
 
-/// The most characters of a value that an error repeats.
+/// The most characters of a value in an error.
 const SHOWN: usize = 40;
 
 /// Reads and parses a file.
@@ -14,28 +14,30 @@ pub(super) fn read(file: &Path) -> Result<Value> {
     parse(&text).map_err(|e| Error::file(file, format!("is not valid JSON: {e}")))
 }
 
-/// Writes a file as a whole. Finite numbers come back bit for bit.
+/// Writes a file atomically. Finite numbers round-trip bit for bit.
 pub(super) fn write(file: &Path, object: &Value) -> Result<()> {
     let text = serde_json::to_string_pretty(object);
     let text = text.map_err(|e| Error::file(file, format!("cannot be written: {e}")))?;
     write_atomic(file, (text + "\n").as_bytes())
 }
 
-/// Parses JSON. Python also writes NaN and Infinity, which JSON does not have: they are read as strings, so that the
-/// error can name the field instead of a line. (As null they would count as absent.)
+/// Parses JSON.
+///
+/// Python also writes NaN and Infinity, which JSON does not have. They are read as strings, so that the error can name
+/// the field instead of a line. As null they would count as absent.
 fn parse(text: &str) -> serde_json::Result<Value> {
     let text = text.trim_start_matches('\u{feff}');
     serde_json::from_str(text).or_else(|error| serde_json::from_str(&quoted(text)).map_err(|_| error))
 }
 
-/// The text with quotes around all numbers that are not finite.
+/// Puts quotes around all non-finite numbers.
 fn quoted(text: &str) -> String {
     let (mut out, mut rest, mut in_string) = (String::with_capacity(text.len()), text, false);
     while let Some(c) = rest.chars().next() {
         let word = ["NaN", "Infinity", "-Infinity"].into_iter().find(|word| !in_string && rest.starts_with(word));
         let taken = match word {
             Some(word) => word.len(),
-            // The character after a backslash does not end a string.
+            // A character after a backslash does not end a string.
             None if c == '\\' => rest.chars().take(2).map(char::len_utf8).sum(),
             None => c.len_utf8(),
         };
@@ -50,7 +52,7 @@ fn quoted(text: &str) -> String {
     out
 }
 
-/// A value as an error repeats it: on one line, and not all of a long one.
+/// A value for an error: on one line, truncated.
 pub(super) fn shown(value: &Value) -> String {
     let text = value.to_string();
     match text.char_indices().nth(SHOWN) {
@@ -59,7 +61,7 @@ pub(super) fn shown(value: &Value) -> String {
     }
 }
 
-/// An object in a document, which knows where it is.
+/// An object of a document, with its path.
 #[derive(Debug, Clone)]
 pub(super) struct Object<'a> {
     /// The file, for errors.
@@ -70,7 +72,7 @@ pub(super) struct Object<'a> {
 }
 
 impl<'a> Object<'a> {
-    /// The document as a whole.
+    /// The top object of a document.
     pub(super) fn top(file: &'a Path, document: &'a Value) -> Result<Self> {
         let members = document.as_object().ok_or_else(|| {
             let what = format!("must be an object with a list `frames`, is {}", shown(document));
@@ -95,12 +97,12 @@ impl<'a> Object<'a> {
         frames.iter().enumerate().map(object).collect()
     }
 
-    /// A member, unless it is absent or null.
+    /// A member; `None` if it is absent or null.
     pub(super) fn get(&self, name: &str) -> Option<&'a Value> {
         self.members.get(name).filter(|value| !value.is_null())
     }
 
-    /// A member that must be there.
+    /// A required member.
     pub(super) fn required(&self, name: &str) -> Result<&'a Value> {
         self.get(name).ok_or_else(|| self.error(name, "is missing"))
     }
@@ -115,7 +117,7 @@ impl<'a> Object<'a> {
         Error::field(self.file, self.field(name), what)
     }
 
-    /// A member that must be `what`, as `read` finds out.
+    /// Reads a member with `read`; an error says that it must be `what`.
     fn typed<T>(&self, name: &str, what: &str, read: impl Fn(&'a Value) -> Option<T>) -> Result<Option<T>> {
         let Some(value) = self.get(name) else { return Ok(None) };
         let found = read(value).ok_or_else(|| self.error(name, format!("must be {what}, is {}", shown(value))));
@@ -140,7 +142,7 @@ impl<'a> Object<'a> {
         self.typed(name, "a string", Value::as_str)
     }
 
-    /// Yes or no; numbers count, as in Python.
+    /// A boolean, or a number as in Python.
     pub(super) fn flag(&self, name: &str) -> Result<Option<bool>> {
         self.typed(name, "true or false", |value| value.as_bool().or_else(|| value.as_f64().map(|x| x != 0.0)))
     }
@@ -161,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn long_values_are_cut() {
+    fn long_values_are_truncated() {
         assert_eq!(shown(&json!([1, 2])), "[1,2]");
         let long = shown(&json!("\u{e9}".repeat(100)));
         assert_eq!(long.chars().count(), SHOWN + 3);

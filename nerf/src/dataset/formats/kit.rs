@@ -10,17 +10,17 @@ use std::path::Path;
 
 pub(super) use raygrad_test_support::damage;
 
-/// A camera 4 units up the z axis that looks down at the origin.
+/// A camera-to-world matrix at 4 on the z axis, looking down at the origin.
 pub(super) fn pose() -> Value {
     json!([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]])
 }
 
-/// A list of frames of these paths, all with that pose.
+/// Frames with these paths and that pose.
 pub(super) fn frames(names: &[&str]) -> Value {
     names.iter().map(|name| json!({ "file_path": name, "transform_matrix": pose() })).collect()
 }
 
-/// Writes a small image, and the folder that it is in.
+/// Writes a small image and creates its folder.
 pub(super) fn picture(path: &Path, width: usize, height: usize) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     Image::new(width, height, 3).save_png(path).unwrap();
@@ -31,7 +31,7 @@ pub(super) fn remove(object: &mut Value, name: &str) {
     object.as_object_mut().unwrap().remove(name).unwrap();
 }
 
-/// The one-line message of an error, which names the file.
+/// The message of an error, which must be one line and name the file.
 #[track_caller]
 pub(super) fn failure(result: Result<Capture>, file: &str) -> String {
     let message = result.unwrap_err().to_string();
@@ -46,12 +46,12 @@ pub(super) fn says(message: &str, parts: &[&str]) {
     }
 }
 
-/// How many damaged files are tried: few, or what PROPTEST_CASES says.
+/// The number of damaged files that a test tries: few, or `PROPTEST_CASES`.
 pub(super) fn cases() -> u32 {
     std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(300)
 }
 
-/// What holds for any capture that was read from a file, damaged or not.
+/// Checks the invariants of a capture that was read from a file, damaged or not.
 #[track_caller]
 pub(super) fn is_whole(capture: &Capture) {
     assert!(!capture.views.is_empty() && capture.applied.is_finite());

@@ -3,14 +3,14 @@
 use super::json::Object;
 use crate::error::{Error, Result};
 
-/// What the file as a whole says, and what a frame says in its place.
+/// The fields of a file and those of a frame, which have priority.
 pub(super) struct Layers<'a, 'b> {
     pub(super) top: &'b Object<'a>,
     pub(super) frame: &'b Object<'a>,
 }
 
 impl<'a, 'b> Layers<'a, 'b> {
-    /// The object whose field counts.
+    /// The object whose field has priority.
     pub(super) fn of(&self, name: &str) -> &'b Object<'a> {
         if self.frame.get(name).is_none() && self.top.get(name).is_some() { self.top } else { self.frame }
     }

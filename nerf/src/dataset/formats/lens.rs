@@ -7,19 +7,21 @@ use crate::error::Result;
 use serde_json::{Map, Value};
 use std::collections::HashMap;
 
-/// The coefficients that files give, by name.
+/// The names of coefficients in files.
 const COEFFICIENTS: [&str; 11] = ["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1", "omega"];
 
-/// A coefficient below this is rounding of one that is 0: it moves nothing by as much as a millionth of a pixel.
+/// The largest coefficient that counts as 0: its effect is below a millionth of a pixel.
 const NOTHING: f64 = 1e-12;
 
-/// Whether a model has a coefficient here: nerfstudio's OPENCV has a third radial one.
+/// Returns true if a model has a coefficient. nerfstudio's OPENCV has a third radial one.
 fn has(model: &Model, coefficient: &str) -> bool {
     model.coefficients.contains(&coefficient) || (model.name, coefficient) == ("OPENCV", "k3")
 }
 
-/// The lens that a file describes. Where it names no camera model, that is OPENCV, or OPENCV_FISHEYE if it says
-/// `is_fisheye`, as instant-ngp has it. One of Brown's without any distortion is a pinhole.
+/// The lens of a file.
+///
+/// Without a camera model it is OPENCV, or OPENCV_FISHEYE if `is_fisheye` is true, as in instant-ngp. A Brown lens
+/// without distortion becomes a pinhole.
 pub(super) fn read(layers: &Layers<'_, '_>) -> Result<Lens> {
     let fisheye = layers.find("is_fisheye", |object, name| object.flag(name))?;
     let named = layers.find("camera_model", |object, name| object.text(name))?;
@@ -61,17 +63,17 @@ pub(super) fn read(layers: &Layers<'_, '_>) -> Result<Lens> {
     }
 }
 
-/// The name of the least model that has this lens and that nerfstudio knows, if it knows any.
+/// The name of the smallest model of nerfstudio for a lens, or a name it does not know if there is none.
 pub(super) fn model(lens: &Lens) -> &'static str {
     least(lens, 3)
 }
 
-/// Writes the coefficients that the model of this name has.
+/// Writes the coefficients of the model.
 pub(super) fn write(lens: &Lens, model: &str, out: &mut Map<String, Value>) {
     let own = |name: &&str| Model::named(model).is_some_and(|model| has(model, name));
     out.extend(COEFFICIENTS.into_iter().filter(own).map(|name| (name.to_owned(), coefficient(lens, name).into())));
     if model == "OPENCV_FISHEYE" {
-        // For instant-ngp, which reads no camera model.
+        // instant-ngp reads this field and no camera model.
         out.insert("is_fisheye".to_owned(), true.into());
     }
 }

@@ -19,7 +19,7 @@ const FILE: &str = "poses_bounds.npy";
 const COLUMNS: usize = 17;
 const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
-/// Whether the folder holds cameras in this format.
+/// Returns true if the folder contains cameras in this format.
 pub(crate) fn detect(folder: &Path) -> bool {
     folder.join(FILE).is_file()
 }
@@ -35,7 +35,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
     parse(folder, &bytes, images(folder)?)
 }
 
-/// As [`read`], for what the file and the folder hold.
+/// [`read`] for the bytes of the file and the images of the folder.
 fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<Capture> {
     let file = folder.join(FILE);
     let matrix = Matrix::read(bytes).map_err(|what| Error::file(&file, what))?;
@@ -64,7 +64,7 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
     Ok(Capture::new(folder, file, Format::Llff, views))
 }
 
-/// The camera of a row, and the depths that it shows.
+/// The camera of a row and the depth bounds of its image.
 fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, [f64; 2]), String> {
     if let Some(column) = row.iter().position(|value| !value.is_finite()) {
         return Err(format!("column {column} is not a finite number"));
@@ -89,8 +89,8 @@ fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, [f64; 2]), Strin
     Ok((Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose }, [near, far]))
 }
 
-/// The names and paths of images in the order of their names: those of the folder `images`, or of the least reduced
-/// folder `images_N` if there are none.
+/// The names and paths of images, sorted by name. They come from the folder `images` or, if that has none, from the
+/// least reduced `images_N`.
 fn images(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
     let mut reduced: Vec<(u32, String)> = vec![];
     for name in names(folder)? {
@@ -118,7 +118,7 @@ fn is_image(name: &str) -> bool {
     EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
 }
 
-/// What a folder holds.
+/// The names of the files in a folder.
 fn names(folder: &Path) -> Result<Vec<String>> {
     let bad = |e: std::io::Error| Error::file(folder, format!("cannot be read: {e}"));
     let entries = std::fs::read_dir(folder).map_err(bad)?;
@@ -165,14 +165,14 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
             row[5 * r..5 * r + 5].copy_from_slice(&[-up[r], right[r], back[r], pose.translation[r], size[r]]);
         }
         [row[15], row[16]] = [near, far];
-        // What could not be read again is not written.
+        // The reader's checks: a written row must be readable.
         camera(&row).map_err(|what| bad("camera", what))?;
         values.extend(row);
     }
     write_atomic(folder.join(FILE), &Matrix { rows: views.len(), columns: COLUMNS, values }.write())
 }
 
-/// What keeps a camera from being written, beside one that is.
+/// Checks that the format can hold a camera together with the first.
 fn plain(camera: &Camera, first: &Camera) -> std::result::Result<(), String> {
     const UNDISTORT: &str = "LLFF needs equal pinhole cameras: undistort first (`raygrad prepare --undistort`)";
     let Camera { width, height, focal, centre, lens, .. } = camera;

@@ -6,7 +6,7 @@ use crate::error::Result;
 use glam::{DAffine3, DMat3, DVec3};
 use serde_json::{Value, json};
 
-/// An affine transform, whatever it does, so long as it can be undone.
+/// Reads an invertible affine transform.
 pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>> {
     let Some(matrix) = object.get(name) else { return Ok(None) };
     let transform = rows(matrix).map_err(|what| object.error(name, what))?;
@@ -17,13 +17,13 @@ pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>
     Ok(Some(transform))
 }
 
-/// A camera-to-world matrix, which must be a rotation and a translation.
+/// Reads a camera-to-world matrix: a rotation and a translation.
 pub(super) fn pose(object: &Object<'_>, name: &str) -> Result<DAffine3> {
     let matrix = object.required(name)?;
     rows(matrix).and_then(rigid).map_err(|what| object.error(name, what))
 }
 
-/// Three or four rows of four finite numbers, the last of four `0 0 0 1`; or what is wrong with them.
+/// Three or four rows of four finite numbers, where a fourth is `0 0 0 1`; or an error message.
 fn rows(matrix: &Value) -> std::result::Result<DAffine3, String> {
     let shape = || format!("must be 3 or 4 rows of 4 numbers, is {}", shown(matrix));
     let rows = matrix.as_array().filter(|rows| rows.len() == 3 || rows.len() == 4).ok_or_else(shape)?;
@@ -43,7 +43,7 @@ fn rows(matrix: &Value) -> std::result::Result<DAffine3, String> {
     Ok(DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) })
 }
 
-/// The transform if it is a rotation and a translation; or what is wrong with it.
+/// Checks that a transform is a rotation and a translation; returns it or an error message.
 fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
     let m = transform.matrix3;
     let scale = (m.x_axis.length() + m.y_axis.length() + m.z_axis.length()) / 3.0;
@@ -58,7 +58,7 @@ fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
     Ok(transform)
 }
 
-/// Three rows of four numbers, as [`affine`] and [`pose`] read them; a fourth row for a pose, as all programs write it.
+/// The rows of a matrix for [`affine`] and [`pose`]: three, or four for a pose, as all programs write it.
 pub(super) fn to_json(transform: DAffine3, count: usize) -> Value {
     let (m, t) = (transform.matrix3, transform.translation);
     let row = |r: usize| match r {

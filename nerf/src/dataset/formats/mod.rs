@@ -57,7 +57,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
 #[cfg(test)]
 mod kit;
 
-/// How many damaged files a test tries: `PROPTEST_CASES`, if that is set.
+/// The number of damaged files that a test tries: `PROPTEST_CASES` if it is set, otherwise `short`.
 #[cfg(test)]
 fn cases(short: u32) -> proptest::prelude::ProptestConfig {
     let cases = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(short);
@@ -70,14 +70,14 @@ mod tests {
     use crate::dataset::capture::Format;
 
     #[test]
-    fn the_first_format_counts() {
+    fn earlier_formats_have_priority() {
         let folder = tempfile::tempdir().unwrap();
         let message = read(folder.path()).unwrap_err().to_string();
         for expected in ["is not a dataset", "transforms.json", "transforms_train.json", "sparse/0", "poses_bounds.npy"]
         {
             assert!(message.contains(expected), "{message}");
         }
-        // From the last to the first: each is found beside those that were there before.
+        // Written from the last format to the first: each has priority over the existing ones.
         let capture = kit::picture_with_camera(folder.path());
         llff::write(&capture, folder.path()).unwrap();
         assert_eq!(read(folder.path()).unwrap().format, Format::Llff);

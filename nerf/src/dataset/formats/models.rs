@@ -53,7 +53,7 @@ impl Model {
     }
 }
 
-/// The name of the least model that has a lens; of Brown's OPENCV has so many radial coefficients.
+/// The name of the smallest model of a lens. Of Brown's models, OPENCV has `radial` radial coefficients.
 pub(super) fn least(lens: &Lens, radial: usize) -> &'static str {
     match lens {
         Lens::Pinhole => "PINHOLE",
@@ -66,7 +66,7 @@ pub(super) fn least(lens: &Lens, radial: usize) -> &'static str {
     }
 }
 
-/// A coefficient of a lens by its name; 0 if it has none of that name.
+/// A lens coefficient by name; 0 if the lens has none of that name.
 pub(super) fn coefficient(lens: &Lens, name: &str) -> f64 {
     let index = lens.coefficient_names().iter().position(|own| *own == name);
     index.map_or(0.0, |index| lens.coefficients()[index])

@@ -2,7 +2,7 @@
 
 use super::limits::start;
 
-/// A matrix, row by row.
+/// A row-major matrix.
 #[derive(Debug, Clone, PartialEq)]
 pub(in crate::dataset) struct Matrix {
     /// Number of rows.
@@ -13,7 +13,7 @@ pub(in crate::dataset) struct Matrix {
     pub values: Vec<f64>,
 }
 
-/// How a file begins.
+/// The first bytes of a file.
 pub(in crate::dataset) const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// The error of a damaged file.
@@ -36,7 +36,7 @@ impl Matrix {
             }
         };
         let [rows, columns] = shape(header)?;
-        // Only as much memory as the file has elements: no product of what a header says decides it.
+        // The header must match the file's length, so that a damaged header cannot exhaust memory.
         let announced = rows.checked_mul(columns).and_then(|count| count.checked_mul(size));
         if announced != Some(data.len()) {
             return Err(format!(
@@ -63,14 +63,14 @@ impl Matrix {
     }
 }
 
-/// The bytes of a `.npy` file of version 1 with f32 numbers, row by row: as many as rows times columns.
+/// Encodes f32 numbers as a `.npy` file of version 1, row-major, rows times columns in number.
 pub(in crate::dataset) fn write_single(shape: [usize; 2], values: &[f32]) -> Vec<u8> {
     write(shape, "<f4", values.iter().map(|value| value.to_le_bytes()))
 }
 
 fn write<const N: usize>([rows, columns]: [usize; 2], descr: &str, values: impl Iterator<Item = [u8; N]>) -> Vec<u8> {
     let mut header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
-    // The elements start at a multiple of 64 bytes, after magic, version and length: 10 bytes.
+    // The elements start at a multiple of 64 bytes, after the 10 bytes of magic, version and length.
     let padding = (10 + header.len() + 1).next_multiple_of(64) - 10 - header.len() - 1;
     header.extend(std::iter::repeat_n(' ', padding));
     header.push('\n');
@@ -82,7 +82,7 @@ fn write<const N: usize>([rows, columns]: [usize; 2], descr: &str, values: impl 
     bytes
 }
 
-/// The header, a Python dictionary, and the elements after it.
+/// The header, a Python dictionary, and the elements.
 fn split(bytes: &[u8]) -> Option<(&str, &[u8])> {
     let [major, _minor, rest @ ..] = bytes.strip_prefix(MAGIC)? else { return None };
     let (length, rest) = match major {
@@ -94,7 +94,7 @@ fn split(bytes: &[u8]) -> Option<(&str, &[u8])> {
     Some((std::str::from_utf8(header).ok()?, data))
 }
 
-/// What follows a key of the header.
+/// The text after a key of the header.
 fn member<'a>(header: &'a str, key: &str) -> Option<&'a str> {
     let after = |quote: char| header.split_once(&format!("{quote}{key}{quote}"));
     let (_, rest) = after('\'').or_else(|| after('"'))?;
@@ -114,7 +114,7 @@ fn shape(header: &str) -> Result<[usize; 2], String> {
 mod tests {
     use super::*;
 
-    /// A file as NumPy writes it, with this dictionary.
+    /// A file in NumPy's encoding with this dictionary.
     fn file(version: u8, dictionary: &str, data: &[u8]) -> Vec<u8> {
         let mut bytes = vec![0x93, b'N', b'U', b'M', b'P', b'Y', version, 0];
         match version {
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said() {
+    fn npy_errors_name_the_problem() {
         let fails = |bytes: &[u8], expected: &str| {
             let what = Matrix::read(bytes).unwrap_err();
             assert!(what.contains(expected), "{what}");
@@ -161,7 +161,7 @@ mod tests {
         fails(&of("<f8", "1, 1, 1", 8), "has 3 axes");
         fails(&of("<f8", "1, x", 8), "is not a complete npy file: copy it again");
         fails(&of("<f8", "2, 1", 8), "has 8 bytes of elements, which do not fit the shape (2, 1): copy it again");
-        // Announces more than any memory holds.
+        // The header announces more elements than memory could hold.
         fails(&of("<f8", "4294967296, 4294967297", 8), "8 bytes of elements");
         fails(&of("<f8", "99999999999999999999, 1", 8), "is not a complete npy file: copy it again");
     }

@@ -5,20 +5,20 @@ use crate::error::Result;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// Endings of image files, tried in this order where a name has none.
+/// Extensions of image files, tried in this order if a name has none.
 const EXTENSIONS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 
-/// The longest path, in bytes: systems take no more than a few times as many.
+/// The longest path, in bytes. Operating systems allow a few times as many at most.
 const LONGEST: usize = 1024;
 
-/// A path as it is used here: with slashes, and without a leading `./`. `name` is the field that holds it, for errors.
+/// Normalises a path to slashes, without a leading `./`. `name` is its field, for errors.
 pub(super) fn normal(object: &Object<'_>, name: &str, value: &Value) -> Result<String> {
     let path = value.as_str().ok_or_else(|| object.error(name, "must be a string"))?;
     if path.len() > LONGEST || path.chars().any(char::is_control) {
         let what = format!("must be a path without control characters, of at most {LONGEST} bytes");
         return Err(object.error(name, what));
     }
-    // Written on Windows. A name with a backslash in it is not one that a dataset has.
+    // Windows separators. Names of datasets contain no backslashes.
     let path = path.replace('\\', "/");
     let mut rest = path.as_str();
     while let Some(shorter) = rest.strip_prefix("./") {
@@ -30,13 +30,13 @@ pub(super) fn normal(object: &Object<'_>, name: &str, value: &Value) -> Result<S
     }
 }
 
-/// The ending of an image file, if the path has one that is known.
+/// The extension of a path if it is that of an image file.
 pub(super) fn extension(path: &str) -> Option<&str> {
     let (stem, given) = path.rsplit_once('.')?;
     (!stem.is_empty() && EXTENSIONS.iter().any(|known| known.eq_ignore_ascii_case(given))).then_some(given)
 }
 
-/// The file at this path from `folder`, or with an ending more, or with its ending in other letters, if there is one.
+/// Finds a file below `folder`: by its path, with an extension appended, or with its extension in the other case.
 pub(super) fn find(folder: &Path, path: &str) -> Option<PathBuf> {
     let both = |stem: &str, extension: &str| {
         [extension.to_ascii_lowercase(), extension.to_ascii_uppercase()].map(|extension| format!("{stem}.{extension}"))
@@ -49,7 +49,7 @@ pub(super) fn find(folder: &Path, path: &str) -> Option<PathBuf> {
     names.map(|name| folder.join(name)).find(|path| path.is_file())
 }
 
-/// The path of a view's image for a file to be written: its name, with the ending that the image has.
+/// The written path of a view's image: its name with the extension of the image.
 pub(super) fn written(name: &str, image: Option<&Path>) -> String {
     let Some(ending) = image.and_then(Path::to_str).and_then(extension) else { return name.to_owned() };
     match extension(name) {
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn files_are_found() {
+    fn paths_find_files_by_extension_and_case() {
         let folder = tempfile::tempdir().unwrap();
         let found = |path: &str| find(folder.path(), path).map(|p| p.strip_prefix(folder.path()).unwrap().to_owned());
         for name in ["a.png", "b.JPG", "c.jpeg", "d.1.WEBP", "e.PNG", "f.png", "f.jpg", "depth.npy"] {
@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn written_paths_have_the_ending_of_the_image() {
+    fn written_paths_have_the_image_extension() {
         let of = |name, image| written(name, Some(Path::new(image)));
         assert_eq!(of("train/r_0", "/d/train/r_0.png"), "train/r_0.png");
         assert_eq!(of("r.5", "/d/r.5.JPG"), "r.5.JPG");

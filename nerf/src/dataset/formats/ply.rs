@@ -7,24 +7,24 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
-/// The longest line, and the most lines of a header: more is no PLY file.
+/// The longest line and the most lines of a header.
 const LONGEST_LINE: u64 = 4096;
 const MOST_LINES: usize = 1000;
 
-/// The colour of points that have none.
+/// The colour of points without one.
 const GREY: [u8; 3] = [128; 3];
 
-/// A number of a vertex: its name, how many bytes it takes, and how their bits, the least byte first, are read.
+/// A number of a vertex: its name, its size in bytes and the decoder of its little-endian bits.
 struct Property {
     name: String,
     size: usize,
     value: fn(u64) -> f64,
-    /// Whether it is a byte without a sign, as colours are.
+    /// True for an unsigned byte, the type of colours.
     is_byte: bool,
 }
 
 impl Property {
-    /// Of a type of this name, if there is one.
+    /// A property of a type by name; `None` for an unknown type.
     fn new(name: &str, kind: &str) -> Option<Self> {
         let (size, value): (usize, fn(u64) -> f64) = match kind {
             "char" | "int8" => (1, |bits| f64::from(bits as i8)),
@@ -40,7 +40,7 @@ impl Property {
         Some(Property { name: name.to_owned(), size, value, is_byte: matches!(kind, "uchar" | "uint8") })
     }
 
-    /// The number in the first bytes, which are taken off.
+    /// Takes the number off the front of the bytes.
     fn take(&self, bytes: &mut &[u8]) -> f64 {
         let (own, rest) = bytes.split_at(self.size);
         *bytes = rest;
@@ -50,15 +50,15 @@ impl Property {
     }
 }
 
-/// What a header says.
+/// The content of a header.
 struct Header {
     ascii: bool,
     count: u64,
-    /// What a vertex has, in order.
+    /// The properties of a vertex, in order.
     properties: Vec<Property>,
 }
 
-/// A line without its end, or what is wrong.
+/// A line without its end, or an error message.
 fn line(reader: &mut impl BufRead) -> std::result::Result<String, String> {
     let mut bytes = vec![];
     let read = reader.by_ref().take(LONGEST_LINE).read_until(b'\n', &mut bytes);
@@ -92,7 +92,7 @@ impl Header {
                     );
                     vertex = true;
                 }
-                // What comes after the vertices is not read.
+                // Elements after the vertices are ignored.
                 ["element", ..] if count.is_some() => vertex = false,
                 ["element", name, ..] => {
                     return Err(format!("has the element `{}` before `vertex`: put the vertices first", cut(name)));
@@ -119,7 +119,7 @@ impl Header {
         self.properties.iter().position(|property| property.name == name)
     }
 
-    /// Where `names` are among the properties: all, or `None`; or what is wrong.
+    /// The indices of `names` in the properties; `None` if all are absent, or an error message if only some exist.
     fn all<const N: usize>(&self, names: [&str; N]) -> std::result::Result<Option<[usize; N]>, String> {
         let found = names.map(|name| self.index(name));
         match found.iter().flatten().count() {
@@ -130,11 +130,11 @@ impl Header {
     }
 }
 
-/// The vertices of a file as points: `x y z`, and if they are there `red green blue`, `error` and `views`, which other
-/// programs pass over. Memory is in proportion to the file.
+/// Reads the vertices as points: `x y z` and, optionally, `red green blue`, `error` and `views`, which other programs
+/// ignore. Memory is proportional to the file.
 ///
 /// # Errors
-/// If the file cannot be read, is no such file, ends too early or has a number that is none.
+/// If the file cannot be read, is not a PLY file, ends too early or has an invalid number.
 pub(super) fn read(path: &Path) -> Result<Vec<Point>> {
     let read = || {
         let file = File::open(path).map_err(|e| format!("cannot be read: {e}"))?;
@@ -144,7 +144,7 @@ pub(super) fn read(path: &Path) -> Result<Vec<Point>> {
     read().map_err(|what: String| Error::file(path, what))
 }
 
-/// As [`read`], of a file of `length` bytes.
+/// [`read`] for a file of `length` bytes.
 fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Point>, String> {
     let header = Header::read(reader)?;
     let position = header.all(["x", "y", "z"])?.ok_or("has no vertex properties x, y and z")?;
@@ -153,7 +153,7 @@ fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Poi
         return Err("has colours of another type than uchar: convert them".to_owned());
     }
     let stride: usize = header.properties.iter().map(|property| property.size).sum();
-    // In text a number takes a character and a space.
+    // In text, a number takes at least a digit and a separator.
     let least = if header.ascii { 2 * header.properties.len() } else { stride } as u64;
     if header.count.checked_mul(least).is_none_or(|bytes| bytes > length.saturating_add(1)) {
         return Err(format!("ends too early: {length} bytes cannot hold {} vertices, copy it again", header.count));
@@ -192,7 +192,7 @@ fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Poi
     Ok(points)
 }
 
-/// The points as a binary file. Places are doubles, so that they come back bit for bit.
+/// Encodes the points as a binary file. Positions are doubles, so that they round-trip bit for bit.
 pub(super) fn to_bytes(points: &[Point]) -> Vec<u8> {
     let mut out = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", points.len());
     let properties = ["double x", "double y", "double z", "uchar red", "uchar green", "uchar blue", "double error"];
@@ -227,19 +227,19 @@ mod tests {
         (0..3).map(point).collect()
     }
 
-    /// As nerfstudio writes it.
+    /// A file in nerfstudio's encoding.
     const TEXT: &str = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
         property uint8 red\nproperty uint8 green\nproperty uint8 blue\nend_header\n\
         0.500000 -1.250000 3.000000 255 128 0\n1e3 2 -0 1 2 3\n";
 
     #[test]
-    fn points_come_back_bit_for_bit() {
+    fn ply_round_trip_is_exact() {
         assert_eq!(parse(&to_bytes(&some())).unwrap(), some());
         assert_eq!(parse(&to_bytes(&[])).unwrap(), []);
     }
 
     #[test]
-    fn text_is_read() {
+    fn ply_text_is_read() {
         let points = parse(TEXT.as_bytes()).unwrap();
         assert_eq!((points[0].position, points[0].color), (DVec3::new(0.5, -1.25, 3.0), [255, 128, 0]));
         assert_eq!((points[1].position, points[1].color), (DVec3::new(1e3, 2.0, 0.0), [1, 2, 3]));
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn every_type_is_read() {
+    fn ply_types_are_all_read() {
         let mut bytes = b"ply\nformat binary_little_endian 1.0\ncomment c\nelement vertex 1\nproperty double nx\n\
             property char x\nproperty short y\nproperty float z\nproperty int a\nproperty uint b\nproperty ushort c\n\
             element face 7\nproperty list uchar int vertex_indices\nend_header\n"
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said() {
+    fn ply_errors_name_the_problem() {
         for (from, to, expected) in [
             ("ply\n", "obj\n", "is not a PLY file: its first line must be `ply`"),
             ("ascii", "binary_big_endian", "use ascii or binary_little_endian"),

@@ -2,10 +2,10 @@
 
 use glam::{DAffine3, DMat3};
 
-/// How far an entry of `R' R` may be from that of the identity. Files carry rounding of about 1e-6.
+/// The largest deviation of `R' R` from the identity. Files contain rounding errors of about 1e-6.
 pub(crate) const TOLERANCE: f64 = 1e-3;
 
-/// Whether no entry of `R' R` is farther than this from that of the identity.
+/// Returns true if no entry of `R' R` deviates from the identity by more than `tolerance`.
 pub(crate) fn is_orthonormal(matrix: &DMat3, tolerance: f64) -> bool {
     (matrix.transpose() * *matrix - DMat3::IDENTITY).to_cols_array().iter().all(|x| x.abs() <= tolerance)
 }
@@ -45,7 +45,7 @@ mod tests {
     use glam::{DQuat, DVec3};
 
     #[test]
-    fn rotations_pass_and_nothing_else() {
+    fn check_accepts_rotations_alone() {
         let turned = DMat3::from_quat(DQuat::from_xyzw(0.1, -0.2, 0.3, 0.9).normalize());
         assert_eq!(rotation(&turned), Ok(()));
         assert_eq!(rotation(&(turned * 1.0004)), Ok(()));
@@ -56,7 +56,7 @@ mod tests {
         fails(turned * 1.001, "orthonormal");
         fails(DMat3::ZERO, "orthonormal");
         fails(DMat3::from_cols(DVec3::X, DVec3::X, DVec3::Z), "orthonormal");
-        // Products that are infinite, and their differences.
+        // Products that overflow, and their differences.
         fails(DMat3::from_cols(DVec3::X, DVec3::splat(1e200), DVec3::new(1e200, -1e200, 0.0)), "orthonormal");
         fails(DMat3::from_cols(DVec3::X, DVec3::Y, -DVec3::Z), "mirrors");
         fails(DMat3::from_cols(DVec3::X, DVec3::Y, DVec3::Z * f64::NAN), "finite");

@@ -19,10 +19,10 @@ use std::path::Path;
 
 const FILE: &str = "transforms.json";
 
-/// Where points are written: nerfstudio's name.
+/// The points file, with nerfstudio's name.
 const POINTS: &str = "sparse_pc.ply";
 
-/// Whether the folder holds a file of this format.
+/// Returns true if the folder contains a file of this format.
 pub(crate) fn detect(folder: &Path) -> bool {
     folder.join(FILE).is_file()
 }
@@ -43,7 +43,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
     read_splits(&top, &mut views)?;
     let scale = top.positive("applied_scale")?.unwrap_or(1.0);
     let transform = matrix::affine(&top, "applied_transform")?.unwrap_or(DAffine3::IDENTITY);
-    // nerfstudio scales what it has transformed.
+    // nerfstudio scales after the transform.
     let applied = DAffine3 { matrix3: scale * transform.matrix3, translation: scale * transform.translation };
     let aabb_scale = top.positive("aabb_scale")?;
     let points_file = match top.get("ply_file_path") {
@@ -51,13 +51,13 @@ pub fn read(folder: &Path) -> Result<Capture> {
         None => None,
     };
     let points_file = points_file.filter(|file| file.is_file());
-    // Its points are in the coordinates of the file: nerfstudio has transformed them along with the cameras.
+    // The points are in the coordinates of the file: nerfstudio transforms them together with the cameras.
     let points = points_file.as_deref().map_or(Ok(vec![]), ply::read)?;
     let capture = Capture::new(folder, file.clone(), Format::Transforms, views);
     Ok(Capture { points, points_file, aabb_scale, applied, ..capture })
 }
 
-/// The field that lists the images of a split.
+/// The field with the images of a split.
 fn list(split: Split) -> String {
     format!("{split}_filenames")
 }
@@ -144,7 +144,8 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
     top.insert("frames".into(), frames.into());
     write_splits(&capture.views, &mut top);
     if capture.applied != DAffine3::IDENTITY {
-        // With its scale in it: poses and points are scaled alike, which nerfstudio's `applied_scale` does not say.
+        // The scale is part of the matrix, since it applies to poses and points alike. nerfstudio's `applied_scale`
+        // does not say so.
         top.insert("applied_transform".into(), matrix::to_json(capture.applied, 3));
     }
     if let Some(scale) = capture.aabb_scale {
@@ -157,14 +158,16 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
     json::write(&file, &top.into())
 }
 
+/// Checks the numbers of a view's camera.
+///
 /// # Errors
-/// If a number of the camera is not finite, or it has no size.
+/// If one is not finite, the camera has no size, or it is a partial panorama.
 fn check(view: &View, file: &Path) -> Result<()> {
     let Camera { width, height, focal, centre, lens, pose } = &view.camera;
     let coefficients = lens.coefficients();
     let numbers = focal.iter().chain(centre).chain(&coefficients).all(|x| x.is_finite()) && pose.is_finite();
     let unit = view.depth.as_ref().is_none_or(|(_, unit)| unit.is_finite());
-    // JSON has no other numbers than finite ones: the rest becomes null.
+    // JSON has finite numbers only; others would become null.
     if !numbers || !unit || *width == 0 || *height == 0 {
         let what = format!("cannot be written: the camera of {} has no size or a non-finite number", view.name);
         return Err(Error::file(file, what));
@@ -179,8 +182,8 @@ fn check(view: &View, file: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The camera model of each view. nerfstudio reads one for the whole file: a pinhole among OPENCV's is one without
-/// distortion.
+/// The camera model of each view. nerfstudio reads one model for the whole file, so pinholes beside OPENCV become
+/// OPENCV without distortion.
 fn models(views: &[View]) -> Vec<&'static str> {
     let mut models: Vec<_> = views.iter().map(|view| lens::model(&view.camera.lens)).collect();
     if models.contains(&"OPENCV") {
@@ -189,7 +192,7 @@ fn models(views: &[View]) -> Vec<&'static str> {
     models
 }
 
-/// The one unit of all depths, if there are any.
+/// The common unit of all depths; `None` if they differ or there are none.
 fn shared_unit(views: &[View]) -> Option<f64> {
     let mut units = views.iter().filter_map(|view| Some(view.depth.as_ref()?.1));
     let first = units.next()?;
@@ -200,7 +203,7 @@ fn file_path(view: &View) -> String {
     paths::written(&view.name, view.image.as_deref())
 }
 
-/// The path of a file that belongs to the capture, as it is written.
+/// The written path of a file of the capture.
 fn relative(capture: &Capture, folder: &Path, path: &Path, file: &Path) -> Result<String> {
     let inside = path.strip_prefix(&capture.folder).or_else(|_| path.strip_prefix(folder)).unwrap_or(path);
     let text = inside.to_str().ok_or_else(|| {
@@ -209,8 +212,8 @@ fn relative(capture: &Capture, folder: &Path, path: &Path, file: &Path) -> Resul
     Ok(if cfg!(windows) { text.replace('\\', "/") } else { text.to_owned() })
 }
 
-/// Writes the lists of the splits, if there are any. nerfstudio then wants all: where there is no set for validation it
-/// is that for tests, which [`read`] knows.
+/// Writes the lists of the splits, if there are any. nerfstudio then requires all three: without validation images that
+/// list equals the test list, as [`read`] knows.
 fn write_splits(views: &[View], top: &mut Map<String, Value>) {
     if views.iter().all(|view| view.split.is_none()) {
         return;

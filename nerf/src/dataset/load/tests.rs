@@ -3,7 +3,7 @@ use crate::dataset::Image;
 use glam::DVec3;
 use std::sync::Mutex;
 
-/// A capture of photographs of 12 x 8 pixels with rising brightness; the third image is absent.
+/// A capture of images of 12 x 8 pixels with rising brightness; the third image is absent.
 fn capture(folder: &Path, count: usize) -> Capture {
     let view = |i: usize| {
         let name = format!("images/{i:02}.png");
@@ -35,12 +35,12 @@ fn every_eighth_image_is_held_out() {
     assert_eq!(numbers(&whole.split(Split::Val).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
     let train = numbers(&whole.split(Split::Train).unwrap());
     assert!(train.len() == 14 && train[0] == "frames[1]" && !train.contains(&"frames[8]".to_owned()), "{train:?}");
-    // An image that is lost puts no photograph in another split.
+    // An absent image does not move others to another split.
     let mut lost = capture(folder.path(), 17);
     lost.views.iter_mut().find(|view| view.field == "frames[5]").unwrap().image = None;
     lost.hold_out();
     assert_eq!(numbers(&lost.split(Split::Test).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
-    // That is said of a capture in whatever order its photographs are.
+    // The order of the images does not matter.
     assert!(!capture(folder.path(), 17).holds_out_every_eighth() && whole.holds_out_every_eighth());
     whole.views.rotate_left(3);
     assert!(whole.holds_out_every_eighth());
@@ -52,7 +52,7 @@ fn every_eighth_image_is_held_out() {
     let mut few = capture(folder.path(), 2);
     few.hold_out();
     assert!(few.split(Split::Test).is_err() && few.split(Split::Train).unwrap().len() == 2);
-    // Where files say what to train on, the others are to test on; where they say more, nothing is added.
+    // With a training list alone, all others become test images; with more lists, nothing is added.
     let mut listed = capture(folder.path(), 4);
     listed.views[1].split = Some(Split::Train);
     listed.hold_out();
@@ -64,7 +64,7 @@ fn every_eighth_image_is_held_out() {
 }
 
 #[test]
-fn no_image_is_trained_and_tested_on() {
+fn image_in_two_splits_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 17);
     capture.hold_out();
@@ -83,7 +83,7 @@ fn no_image_is_trained_and_tested_on() {
 }
 
 #[test]
-fn cameras_follow_images_to_any_size() {
+fn cameras_scale_with_their_images() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
     capture.hold_out();
@@ -95,7 +95,7 @@ fn cameras_follow_images_to_any_size() {
     assert_eq!((data.frames.len(), &data.skipped[..]), (3, &["images/02.png".to_owned()][..]));
     let frame = &data.frames[0];
     let view = capture.views.iter().find(|view| view.name == frame.name).unwrap();
-    // 12 / 5 and 8 / 5, rounded; the camera was for 24 x 16.
+    // 12 / 5 and 8 / 5, rounded; the camera has the size 24 x 16.
     assert_eq!([frame.image.width, frame.image.height, frame.camera.width, frame.camera.height], [2, 2, 2, 2]);
     assert!((frame.camera.centre[0] - 13.0 / 12.0).abs() < 1e-12 && (frame.camera.centre[1] - 7.0 / 8.0).abs() < 1e-12);
     assert!((frame.camera.focal[0] - view.camera.focal[0] / 12.0).abs() < 1e-12);
@@ -143,7 +143,7 @@ fn image_of_other_shape_than_camera_is_an_error() {
 }
 
 #[test]
-fn downscaled_image_folders_are_used_as_they_are() {
+fn downscaled_image_folders_are_used() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
     capture.hold_out();
@@ -187,7 +187,7 @@ fn masks_drop_black_and_unlit_pixels() {
     std::fs::write(&path, Image::new(24, 16, 1).to_png()).unwrap();
     let message = capture.load(Split::Train, &survey, &LoadOptions::default()).unwrap_err().to_string();
     assert!(message.contains("has no usable pixel"), "{message}");
-    // Half a turn is 31.4 pixels from the centre of a fisheye of focal length 10.
+    // Half a turn is 31.4 pixels from the centre of a fisheye with the focal length 10.
     let lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
     let camera =
         Camera { width: 100, height: 60, focal: [10.0; 2], centre: [50.0, 30.0], lens, pose: DAffine3::IDENTITY };
@@ -203,7 +203,7 @@ fn masks_drop_black_and_unlit_pixels() {
 }
 
 #[test]
-fn an_object_before_white_is_bounded() {
+fn object_in_front_of_white_is_bounded() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
     capture.hold_out();
@@ -213,11 +213,11 @@ fn an_object_before_white_is_bounded() {
             image.data.iter_mut().enumerate().for_each(|(k, value)| {
                 let (x, y) = (k / 3 % 12, k / 36);
                 let is_border = x == 0 || y == 0 || x == 11 || y == 7;
-                // A little darker than white in one channel, as JPEG has it.
+                // A little darker than white in one channel, as after JPEG compression.
                 *value = if is_border { border - 0.02 * (k % 3 / 2) as f32 } else { 0.3 };
             });
             if i < spoilt {
-                // Of 36 pixels one.
+                // One of the 36 border pixels.
                 image.data[3 * 11] = 0.5;
             }
             std::fs::write(
@@ -232,12 +232,12 @@ fn an_object_before_white_is_bounded() {
     assert_eq!((white.scene_type, &white.reason[..36]), (SceneType::Bounded, "images show an object before white; "));
     assert_eq!(paint(0.9, 0).scene_type, SceneType::Unbounded);
     assert_eq!(paint(1.0, 9).scene_type, SceneType::Unbounded, "a spot on the border of each");
-    // Of three that are looked at, all have to be so.
+    // All of the three images read must have a white border.
     assert_eq!(paint(1.0, 3).scene_type, SceneType::Unbounded);
 }
 
 #[test]
-fn distances_are_read_where_they_are_asked_for() {
+fn distances_are_read_if_requested() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
     capture.hold_out();
@@ -256,7 +256,7 @@ fn distances_are_read_where_they_are_asked_for() {
     for frame in &data.frames {
         let Some(found) = &frame.distances else { continue };
         assert_eq!((frame.name.as_str(), [found.width, found.height]), ("images/03.png", [12, 8]));
-        // Five units of the capture along the axis.
+        // A depth of 5 in units of the capture.
         let place = frame.camera.ray(1.5, 2.5).at(f64::from(found.data[2 * 12 + 1]));
         let depth = -frame.camera.pose.inverse().transform_point3(place).z / survey.transform.scale;
         assert!((depth - 5.0).abs() < 1e-5, "{depth}");
@@ -269,7 +269,7 @@ fn unlit_pixels_are_dropped_with_or_without_mask() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
     capture.hold_out();
-    // Half a turn is 3.14 of the 12 x 8 pixels from the centre, which the camera has for 24 x 16.
+    // Half a turn is 3.14 of the 12 x 8 pixels from the centre; the camera has the size 24 x 16.
     let lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
     for view in &mut capture.views {
         (view.camera.lens, view.camera.focal, view.camera.centre) = (lens, [2.0; 2], [12.0, 8.0]);

@@ -3,10 +3,10 @@
 use super::{Photo, Values};
 use crate::dataset::average::Stored;
 
-/// The width of a new pixel, in pixels of the image, above which it is averaged over more than one place. A little
-/// above one: less shows no aliasing, and an average would only blur.
+/// The width of a new pixel, in pixels of the image, above which it is averaged over several points. A little above 1,
+/// since smaller widths do not alias and an average would only blur.
 const COVERED: f64 = 1.25;
-/// Places in a row and in a column of a new pixel, at most.
+/// The most points per row and column of a new pixel.
 const MOST_PLACES: usize = 16;
 
 impl Photo {
@@ -34,7 +34,7 @@ impl Photo {
         for Place { middle, across, down } in places {
             let count = |step: [f64; 2]| {
                 let covered = step[0].hypot(step[1]) - (COVERED - 1.0);
-                // Not finite where a lens puts nothing: one place is as good as many.
+                // The steps are not finite where the lens has no image; one point is enough there.
                 (covered.ceil() as usize).clamp(1, MOST_PLACES)
             };
             let counts = [count(across), count(down)];
@@ -53,16 +53,16 @@ impl Photo {
     }
 }
 
-/// The position of a new pixel in the image: its centre, and the steps of a pixel across and down.
+/// The position of a new pixel in the image: its centre, and the steps to the next pixel across and down.
 struct Place {
     middle: [f64; 2],
     across: [f64; 2],
     down: [f64; 2],
 }
 
-/// The places of all pixels, row by row. `from` is evaluated once per pixel: steps are the differences of neighbours.
+/// The positions of all pixels, row-major. `from` is evaluated once per pixel: steps are differences of neighbours.
 fn places([width, height]: [usize; 2], from: impl Fn([f64; 2]) -> [f64; 2]) -> impl Iterator<Item = Place> {
-    // From the one before the first pixel to the one after the last.
+    // From one before the first pixel to one after the last.
     let row = move |y: f64| -> Vec<[f64; 2]> { (0..width + 2).map(|x| from([x as f64 - 0.5, y])).collect() };
     let mut rows = [vec![], row(-0.5), row(0.5)];
     (0..height).flat_map(move |y| {
@@ -79,7 +79,7 @@ fn places([width, height]: [usize; 2], from: impl Fn([f64; 2]) -> [f64; 2]) -> i
     })
 }
 
-/// Pixels with weights that may be negative.
+/// A sum of pixels; weights may be negative.
 #[derive(Default)]
 struct Sum {
     colors: [f64; 3],
@@ -88,7 +88,7 @@ struct Sum {
 }
 
 impl Sum {
-    /// Adds what is at a place.
+    /// Adds the interpolated value at a position.
     fn add<S: Stored>(&mut self, values: &[S], channels: usize, size: [usize; 2], place: [f64; 2]) {
         let [columns, rows] = [0, 1].map(|axis| taps(place[axis], size[axis]));
         for (y, down) in rows {
@@ -113,9 +113,9 @@ impl Sum {
     }
 }
 
-/// The pixels around a continuous position on a line of `count`, and their weights, which add up to 1.
+/// The pixels around a continuous position on a line of `count`, and their weights, which sum to 1.
 fn taps(position: f64, count: usize) -> [(usize, f64); 4] {
-    // Far away it is all the same, and a number that is none becomes a place.
+    // Far outside all positions are equal. NaN becomes 0.
     let position = (position - 0.5).clamp(-2.0, count as f64 + 1.0);
     let position = if position.is_nan() { 0.0 } else { position };
     let first = position.floor();
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_grid_gives_the_same_bytes() {
+    fn resampling_on_the_same_grid_is_exact() {
         let data = (0..4 * 5 * 3).map(|i| (i * 37 % 256) as u8).map(|x| x.max(1)).collect();
         let photo = Photo { width: 5, height: 3, channels: 4, values: Values::Bytes(data) };
         assert_eq!(photo.resampled([5, 3], |place| place), photo);
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_transparent_does_not_bleed() {
+    fn transparent_pixels_do_not_bleed() {
         let data = [[200, 100, 0, 255], [0, 255, 255, 0]].concat();
         let photo = Photo { width: 2, height: 1, channels: 4, values: Values::Bytes(data) };
         let between = photo.resampled([1, 1], |_| [1.0, 0.5]).pixel(0, 0);
@@ -164,7 +164,7 @@ mod tests {
 
     #[test]
     fn downscaled_images_are_averages() {
-        // Stripes of one pixel: any single place shows black or white.
+        // Stripes of one pixel: a single point would be black or white.
         let stripes = photo(100, 10, |x, _| (x as usize % 2) as f64);
         let small = stripes.resampled([20, 2], |[x, y]| [5.0 * x, 5.0 * y]);
         assert!((2..18).all(|x| (small.pixel(x, 0)[0] - 0.5).abs() < 0.12), "{small:?}");
@@ -176,7 +176,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn parabolas_are_met_exactly([a, b, c] in prop::array::uniform3(-0.1..0.1_f64), shift in -0.5..0.5_f64) {
+        fn resampling_is_exact_for_parabolas([a, b, c] in prop::array::uniform3(-0.1..0.1_f64), shift in -0.5..0.5_f64) {
             let value = |x: f64, y: f64| 0.5 + 0.1 * (a * x + b * y) + 0.01 * c * x * x;
             let moved = photo(12, 9, value).resampled([12, 9], |[x, y]| [x + shift, y - shift]);
             for (x, y) in [(3, 3), (6, 4), (8, 5)] {

@@ -10,10 +10,10 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageBuffer, ImageDecoder, ImageEncoder, ImageError};
 use std::path::Path;
 
-/// Of 100: what is lost cannot be seen.
+/// Of 100. The loss is not visible.
 const JPEG_QUALITY: u8 = 95;
 
-/// What a file says of its image, beside its pixels.
+/// The metadata of a file.
 #[derive(Default)]
 struct About {
     exif: Option<Vec<u8>>,
@@ -34,7 +34,7 @@ impl Photo {
             (Values::Bytes(v), _) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgba8),
             (Values::Words(v), 3) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgb16),
             (Values::Words(v), _) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgba16),
-            // What was no integer before is a byte now.
+            // Floats become bytes.
             (Values::Floats(v), channels) => {
                 let bytes = v.iter().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
                 match channels {
@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_hold_as_many_bits_as_photographs() {
+    fn saved_files_keep_the_bit_depth() {
         let folder = tempfile::tempdir().unwrap();
         let words = |channels: usize| (0..channels as u16 * 6).map(|i| i * 2700).collect::<Vec<u16>>();
         for (channels, values) in [
@@ -135,7 +135,7 @@ mod tests {
     fn upright_copies_keep_metadata() {
         let folder = tempfile::tempdir().unwrap();
         let [from, to] = ["from.jpg", "to.jpg"].map(|name| folder.path().join(name));
-        // Two entries: the orientation, and the focal length as on film of 35 mm.
+        // Two entries: the orientation, and the focal length in 35 mm equivalents.
         let exif = |turn: u8| {
             let mut exif = b"MM\0*\0\0\0\x08\0\x02\x01\x12\0\x03\0\0\0\x01\0".to_vec();
             exif.extend([turn, 0, 0]);

@@ -13,8 +13,7 @@ impl Photo {
     }
 }
 
-/// The variance of the Laplacian of a grey image, which gives its lines by their number; 0 if a side is shorter than 3
-/// pixels.
+/// The variance of the Laplacian of a grey image; 0 if a side is shorter than 3 pixels. `line` returns a row by number.
 pub(crate) fn laplacian_variance([width, height]: [usize; 2], line: impl Fn(usize) -> Vec<f32>) -> f64 {
     if width < 3 || height < 3 {
         return 0.0;
@@ -44,7 +43,7 @@ mod tests {
     use crate::dataset::image::Image;
 
     #[test]
-    fn what_is_blurred_is_less_sharp() {
+    fn blurred_images_are_less_sharp() {
         let stripes = |value: fn(usize) -> f32| {
             let data = (0..40 * 30).flat_map(|i| [value(i % 40 + i / 40); 3]).collect();
             Photo::from(Image { width: 40, height: 30, channels: 3, data }).sharpness()
@@ -52,9 +51,9 @@ mod tests {
         let sharp = stripes(|x| f32::from(u8::from(x % 8 < 4)));
         let blurred = stripes(|x| [0.0, 0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25][x % 8]);
         assert!(sharp > 4.0 * blurred && blurred > 0.0, "{sharp} {blurred}");
-        // A slope is not sharp, however steep it is.
+        // A gradient is not sharp, however steep.
         assert!(stripes(|x| x as f32 / 70.0) < 1e-10);
-        // Of [0 0 1 0 0] in three equal rows the Laplacian is 1, -2, 1: its variance is 2.
+        // The Laplacian of three equal rows [0 0 1 0 0] is 1, -2, 1; its variance is 2.
         let data = [0.0, 0.0, 1.0, 0.0, 0.0].repeat(3).iter().flat_map(|x| [*x; 3]).collect();
         let line = Photo::from(Image { width: 5, height: 3, channels: 3, data });
         assert!((line.sharpness() - 2.0).abs() < 1e-6);

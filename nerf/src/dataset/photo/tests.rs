@@ -28,17 +28,17 @@ fn image_takes_as_many_bytes_as_its_file_has_values() {
 }
 
 #[test]
-fn sizes_that_do_not_divide_share_pixels() {
+fn resizing_to_other_ratios_shares_pixels() {
     let line = bytes(3, 1, 3, &[0, 0, 0, 90, 90, 90, 240, 240, 240]);
-    // Two pixels of one and a half: (0 + 90 / 2) / 1.5 and (90 / 2 + 240) / 1.5.
+    // Two pixels that cover one and a half each: (0 + 90 / 2) / 1.5 and (90 / 2 + 240) / 1.5.
     assert_eq!(line.resized([2, 1]), bytes(2, 1, 3, &[30, 30, 30, 190, 190, 190]));
     assert_eq!(line.resized([3, 1]), line);
-    // What is transparent does not bleed into what is not.
+    // Transparent pixels do not bleed into opaque ones.
     let rgba = bytes(3, 1, 4, &[200, 0, 0, 255, 9, 9, 9, 0, 0, 100, 0, 255]);
     assert_eq!(rgba.resized([1, 1]), bytes(1, 1, 4, &[100, 50, 0, 170]));
     assert_eq!((rgba.transparent_share(), line.transparent_share()), (1.0 / 3.0, 0.0));
     assert_eq!(bytes(1, 2, 4, &[1, 2, 3, 255, 1, 2, 3, 0]).transparent_share(), 0.5);
-    // Rows and columns are not exchanged, and words stay words.
+    // Rows and columns keep their order, and 16-bit values stay 16-bit.
     let words = Photo { width: 4, height: 2, channels: 3, values: Values::Words((0..24).map(|i| i * 2000).collect()) };
     let Values::Words(small) = words.resized([2, 1]).values else { panic!("no words") };
     assert_eq!(small, [15000, 17000, 19000, 27000, 29000, 31000]);
@@ -46,16 +46,16 @@ fn sizes_that_do_not_divide_share_pixels() {
 
 #[test]
 #[should_panic(expected = "cannot be downsized to 4x1")]
-fn averaging_does_not_enlarge() {
+fn resizing_does_not_enlarge() {
     bytes(3, 1, 3, &[0; 9]).resized([4, 1]);
 }
 
-/// A JPEG of 16 x 8 pixels that is white in its upper left quarter, with this EXIF orientation.
+/// A JPEG of 16 x 8 pixels with this EXIF orientation. Its upper left quarter is white.
 fn jpeg(orientation: u8) -> Vec<u8> {
     let mut plain = vec![];
     let picture = image::RgbImage::from_fn(16, 8, |x, y| image::Rgb([if x < 8 && y < 4 { 255 } else { 0 }; 3]));
     picture.write_to(&mut std::io::Cursor::new(&mut plain), ImageFormat::Jpeg).unwrap();
-    // An APP1 segment with one directory of one entry: tag 0x0112, a short.
+    // An APP1 segment with a directory of one entry: tag 0x0112, a short.
     let mut exif = b"\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
     exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
     [&plain[..2], &exif, &plain[2..]].concat()
@@ -66,7 +66,7 @@ fn images_are_turned_upright_unless_calibrated() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("photo.jpg");
     let white = |photo: &Photo, x: usize, y: usize| photo.pixel(x, y)[0] > 0.5;
-    // Where the white corner goes: upper left, upper right, lower left, lower right.
+    // The corner that the white one moves to: upper left, upper right, lower left, lower right.
     for (orientation, size, corner) in [
         (1, [16, 8], 0),
         (2, [16, 8], 1),
@@ -87,14 +87,14 @@ fn images_are_turned_upright_unless_calibrated() {
             let seen = [[0, 0], [right, 0], [0, bottom], [right, bottom]].map(|[x, y]| white(&photo, x, y));
             assert_eq!(seen, [0, 1, 2, 3].map(|i| i == corner), "orientation {orientation}");
         }
-        // A camera that was measured on the pixels as they are stored, also where turning would not change their size.
+        // A camera with the stored size keeps the stored orientation, also if turning would not change the size.
         let stored = Photo::open(&path, Some([16, 8])).unwrap();
         assert!([stored.width, stored.height] == [16, 8] && white(&stored, 0, 0) && !white(&stored, 15, 0));
     }
 }
 
 #[test]
-fn png_jpeg_and_webp_are_told_by_their_contents() {
+fn formats_are_detected_by_content() {
     let folder = tempfile::tempdir().unwrap();
     let picture = image::RgbaImage::from_fn(5, 4, |x, y| image::Rgba([x as u8 * 50, y as u8 * 60, 7, 255 - x as u8]));
     for format in [ImageFormat::Png, ImageFormat::WebP] {
@@ -107,12 +107,12 @@ fn png_jpeg_and_webp_are_told_by_their_contents() {
 }
 
 #[test]
-fn a_header_that_promises_too_much_is_an_error() {
+fn oversized_header_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("picture.png");
     std::fs::write(&path, jpeg(1)).unwrap();
     assert!(!Photo::file_has_alpha(&path).unwrap() && Photo::open(&path, None).is_ok());
-    // A PNG whose header, with its checksum, says 2^20 x 2^20 pixels.
+    // A PNG header of 2^20 x 2^20 pixels, with a valid checksum.
     let head: &[u8] = b"IHDR\0\x10\0\0\0\x10\0\0\x08\x02\0\0\0";
     let checksum = head.iter().fold(!0_u32, |sum, byte| {
         (0..8).fold(sum ^ u32::from(*byte), |sum, _| if sum & 1 == 1 { 0xedb8_8320 ^ (sum >> 1) } else { sum >> 1 })
@@ -125,7 +125,7 @@ fn a_header_that_promises_too_much_is_an_error() {
 
 proptest! {
     #[test]
-    fn the_mean_of_a_photograph_stays_at_any_size(
+    fn resizing_keeps_the_mean(
         [width, height] in prop::array::uniform2(1..12_usize), to in prop::array::uniform2(1..12_usize), seed in any::<u8>(),
     ) {
         let to = [to[0].min(width), to[1].min(height)];

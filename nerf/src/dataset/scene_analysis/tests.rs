@@ -20,7 +20,7 @@ fn capture(format: Format, cameras: Vec<Camera>) -> Capture {
 
 const CENTRE: DVec3 = DVec3::new(10.0, 20.0, 5.0);
 
-/// Eyes on a quarter of a circle of that radius around the centre, pitched down, with y downwards as COLMAP has it.
+/// Cameras on a quarter circle of that radius around the centre, pitched down, with y downwards as in COLMAP.
 fn quarter(radius: f64) -> Vec<Camera> {
     let eye = |i: usize| {
         let angle = i as f64 * 0.3;
@@ -33,16 +33,16 @@ fn quarter(radius: f64) -> Vec<Camera> {
 fn centre_and_up_come_from_cameras() {
     let survey = SceneAnalysis::new(&capture(Format::Colmap, quarter(4.0)), None, None).unwrap();
     assert_eq!(survey.scene_type, SceneType::Unbounded);
-    // Axes are held back a little towards the cameras.
+    // Damping pulls the centre a little towards the cameras.
     assert!(survey.transform.origin.distance(CENTRE) < 0.05, "{}", survey.transform.origin);
     let up = survey.transform.rotation * DVec3::NEG_Y;
     assert!(up.distance(DVec3::Z) < 1e-3, "{up}");
     survey.transform.check().unwrap();
-    // Half of the box is half of the cameras' distance, and 1.5 units.
+    // Half of the box is half of the cameras' distance, which becomes 1.5 units.
     assert!((survey.transform.scale - 1.5 / 2.0).abs() < 0.005, "{}", survey.transform.scale);
     assert_eq!(survey.bounds, [DVec3::splat(-1.5), DVec3::splat(1.5)]);
     assert!((survey.near - 0.05 * 3.0).abs() < 1e-3 && (survey.far - 3000.0).abs() < 1e-9, "{survey:?}");
-    // A camera that is lost, far away and looking elsewhere, moves it little.
+    // An outlier, far away and looking elsewhere, has little influence.
     let mut cameras = quarter(4.0);
     cameras.push(camera(CENTRE + DVec3::new(300.0, 50.0, 0.0), CENTRE + DVec3::new(300.0, 90.0, 20.0), DVec3::NEG_Y));
     let lost = SceneAnalysis::new(&capture(Format::Colmap, cameras), None, None).unwrap();
@@ -50,7 +50,7 @@ fn centre_and_up_come_from_cameras() {
 }
 
 #[test]
-fn outward_cameras_stand_at_the_centre() {
+fn outward_cameras_are_at_the_centre() {
     let outwards = [[1.0, 0.0], [0.0, 1.0], [0.3, -1.0], [2.0, 0.5]].map(|[x, y]| {
         let eye = DVec3::new(x, y, 0.0);
         camera(eye, 3.0 * eye, DVec3::Z)
@@ -60,7 +60,7 @@ fn outward_cameras_stand_at_the_centre() {
     assert!(survey.transform.origin.distance(mean) < 1e-9, "{}", survey.transform.origin);
     assert!(survey.transform.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "upright already");
     assert!(survey.reason.ends_with("; cameras look around"), "{}", survey.reason);
-    // What they see is thought to be three times as far as they stand apart, unless points say where.
+    // The scene is assumed to be three times as far as the cameras' spread, unless points give a distance.
     let spread = median(outwards.iter().map(|camera| camera.pose.translation.distance(mean)));
     let half = |survey: &SceneAnalysis| 1.5 / survey.transform.scale;
     assert!((half(&survey) - 3.0 * spread).abs() < 1e-9, "{}", half(&survey));
@@ -68,13 +68,13 @@ fn outward_cameras_stand_at_the_centre() {
     let wall = |i: usize| mean + 7.0 * DVec3::new((i as f64).cos(), (i as f64).sin(), 0.0);
     room.points = (0..150).map(|i| Point { position: wall(i), color: [0; 3], error: 1.0, views: 3 }).collect();
     assert!((half(&SceneAnalysis::new(&room, None, None).unwrap()) - 7.0).abs() < 1e-9);
-    // Points in between the cameras do not make the box smaller than their own.
+    // Points among the cameras do not shrink the box below the cameras' spread.
     room.points.iter_mut().for_each(|point| point.position = mean + 1e-3 * point.position);
     assert!((half(&SceneAnalysis::new(&room, None, None).unwrap()) - spread).abs() < 1e-9);
 }
 
 #[test]
-fn parallel_cameras_show_what_lies_ahead() {
+fn parallel_cameras_put_the_centre_ahead() {
     let wall = (0..5).map(|i| {
         let eye = DVec3::new(0.1 * f64::from(i), 0.05 * f64::from(i % 2), 0.0);
         camera(eye, eye + DVec3::Y, DVec3::Z)
@@ -107,17 +107,17 @@ fn parallel_cameras_show_what_lies_ahead() {
     let survey = SceneAnalysis::new(&wall, None, None).unwrap();
     assert!(survey.transform.origin.distance(mean + 3.98 * DVec3::Y) < 0.01, "{}", survey.transform.origin);
     assert!((1.5 / survey.transform.scale - 1.99).abs() < 0.03, "half of the distance");
-    // Depth counts, and not how far to a side: a flight at a height of 50 over a wide field.
+    // Depth alone counts, not lateral distance: a flight at a height of 50 over a wide field.
     let flight = (0..25).map(|i| {
         let eye = DVec3::new(100.0 * f64::from(i % 5), 100.0 * f64::from(i / 5), 50.0);
-        // Held a little askew, as by the wind: axes meet nowhere in particular.
+        // Slightly tilted, so that the axes have no common point.
         let askew = 3.0 * DVec3::new((7.0 * f64::from(i)).sin(), (3.0 * f64::from(i)).cos(), 0.0);
         camera(eye, eye + askew - 50.0 * DVec3::Z, DVec3::Y)
     });
     let mut flight = capture(Format::Colmap, flight.collect());
     let field = |i: usize| DVec3::new(400.0 * (i as f64).sin().powi(2), 400.0 * (1.3 * i as f64).cos().powi(2), 0.0);
     flight.points = (0..500).map(|i| Point { position: field(i), color: [0; 3], error: 1.0, views: 3 }).collect();
-    // A hundred that are not to be trusted.
+    // Many unreliable points.
     let bad = Point { position: DVec3::new(0.0, 0.0, -900.0), color: [0; 3], error: 9.0, views: 1 };
     flight.points.extend(std::iter::repeat_n(bad, 600));
     let survey = SceneAnalysis::new(&flight, None, None).unwrap();
@@ -131,7 +131,7 @@ fn parallel_cameras_show_what_lies_ahead() {
 }
 
 #[test]
-fn a_walk_ahead_is_no_view_from_a_window() {
+fn forward_walk_is_not_forward_facing() {
     let walk = (0..5).map(|i| {
         let eye = DVec3::new(0.1 * f64::from(i % 2), 0.3 * f64::from(i), 0.0);
         camera(eye, eye + DVec3::Y, DVec3::Z)
@@ -147,8 +147,8 @@ fn a_walk_ahead_is_no_view_from_a_window() {
 }
 
 #[test]
-fn cameras_that_look_down_have_the_sky_behind_them() {
-    // Two strips of a flight, the second flown back: no side of the pictures is up.
+fn downward_cameras_have_up_behind_them() {
+    // Two strips of a flight; the second is flown back, so the cameras have no common up axis.
     let flight = (0..8).map(|i| {
         let north = if i % 2 == 0 { DVec3::Y } else { DVec3::NEG_Y };
         let eye = DVec3::new(f64::from(i), f64::from(i % 3), 50.0);
@@ -165,7 +165,7 @@ fn bounded_scene_is_as_wide_as_cameras_see() {
     let survey =
         SceneAnalysis::new(&capture(Format::Transforms, cameras.to_vec()), Some("it is transparent"), None).unwrap();
     assert_eq!(survey.scene_type, SceneType::Bounded);
-    // Half of 300 rows over a focal length of 250 is more than half of 400 columns over 500: .6 of the distance 4.
+    // Half of 300 rows over a focal length of 250 is more than half of 400 columns over 500: 0.6 of the distance 4.
     let half = 1.5 / survey.transform.scale;
     assert!((half - 2.4).abs() < 0.02, "{half}");
     let (near, far) = (survey.near / survey.transform.scale, survey.far / survey.transform.scale);
@@ -173,12 +173,12 @@ fn bounded_scene_is_as_wide_as_cameras_see() {
 }
 
 #[test]
-fn points_and_depths_say_where_a_scene_begins() {
+fn near_plane_comes_from_points_or_depths() {
     let mut capture = capture(Format::Colmap, quarter(4.0));
     let eye = capture.views[0].camera.pose.translation;
     let towards = (CENTRE - eye).normalize();
     let point = |distance: f64| Point { position: eye + distance * towards, color: [0; 3], error: 1.0, views: 3 };
-    // Of four hundred the two nearest are not believed.
+    // The two nearest of four hundred are ignored.
     capture.points =
         (0..400).map(|i| point([0.1, 0.2, 1.0].get(i).copied().unwrap_or(1.0 + 0.01 * i as f64))).collect();
     let near = |capture: &Capture| {
@@ -192,10 +192,10 @@ fn points_and_depths_say_where_a_scene_begins() {
         spoilt.points.iter_mut().for_each(spoil);
         assert!((near(&spoilt) - usual).abs() < 0.01, "{}", near(&spoilt));
     }
-    // Files of nerfstudio do not count photographs.
+    // nerfstudio's files do not count the images of a point.
     capture.points.iter_mut().for_each(|p| (p.views, p.error) = (0, f64::NAN));
     assert!((near(&capture) - 0.5).abs() < 0.2);
-    // A capture that looks forward: the middle is ahead, halfway in inverse distance.
+    // A forward-facing capture: the centre is ahead, halfway in inverse distance.
     let forward = (0..5).map(|i| {
         let eye = DVec3::new(0.1 * f64::from(i), 0.0, 0.0);
         camera(eye, eye + DVec3::Y, DVec3::Z)
@@ -214,7 +214,7 @@ fn scene_type_flag_beats_convention_beats_alpha() {
         capture.views.iter_mut().for_each(|view| view.camera.pose.translation -= CENTRE);
         capture
     };
-    // Opaque photographs show what lies behind, wherever their cameras stand.
+    // Opaque images show a background, wherever their cameras are.
     assert_eq!(SceneAnalysis::new(&around(4.0), None, None).unwrap().scene_type, SceneType::Unbounded);
     let asked = SceneAnalysis::new(&around(4.0), None, Some(SceneType::Bounded)).unwrap();
     let conventional = SceneAnalysis::new(&around(4.0), Some("it is transparent"), None).unwrap();

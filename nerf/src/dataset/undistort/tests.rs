@@ -18,14 +18,14 @@ fn fisheye() -> Lens {
     Lens::Fisheye { k: [0.01, -0.02, 0.0, 0.0], p: [0.0; 2], s: [0.0; 2] }
 }
 
-/// A smooth function of direction, whose waves are a good ten pixels long.
+/// A smooth function of the direction, with a wavelength of about ten pixels.
 fn color(direction: DVec3) -> [f32; 3] {
     let DVec3 { x, y, z } = direction;
     [(9.0 * x + 3.0 * y).sin(), (8.0 * y * z - 2.0 * x).cos(), (7.0 * (x * y + z)).sin()]
         .map(|value| (0.5 + 0.4 * value) as f32)
 }
 
-/// What a camera sees of it, as 16-bit PNG.
+/// Writes a camera's image of it, as 16-bit PNG.
 fn taken(camera: &Camera, path: &Path) {
     let pixels = (0..camera.width * camera.height).map(|i| (i % camera.width, i / camera.width));
     let words = pixels.flat_map(|(x, y)| color(camera.pixel_ray(x, y).direction).map(|v| (v * 65535.0).round() as u16));
@@ -41,7 +41,7 @@ fn view(camera: Camera, path: &Path) -> View {
 }
 
 #[test]
-fn an_undistorted_photograph_is_what_a_pinhole_sees() {
+fn undistorted_image_equals_a_pinhole_image() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("photo.png");
     for lens in [barrel(), pincushion(), fisheye(), Lens::Fov { omega: 0.9 }, Lens::Pinhole] {
@@ -55,7 +55,7 @@ fn an_undistorted_photograph_is_what_a_pinhole_sees() {
             let expected = color(to.pixel_ray(x, y).direction);
             let pixel = photo.pixel(x, y);
             let off = pixel.iter().zip(expected).map(|(a, b)| (a - b).abs());
-            // At the border the photograph itself ends within a pixel.
+            // The source image ends within a pixel of the border.
             let inside = (2..to.width - 2).contains(&x) && (2..to.height - 2).contains(&y);
             worst = off.fold(worst, |worst, off| if inside { worst.max(off) } else { worst });
         }
@@ -64,7 +64,7 @@ fn an_undistorted_photograph_is_what_a_pinhole_sees() {
 }
 
 #[test]
-fn no_pixel_is_empty_and_none_could_be_more() {
+fn undistorted_size_is_the_largest_without_gaps() {
     for lens in [barrel(), pincushion(), Lens::Pinhole] {
         let from = camera(lens);
         let to = Camera::undistorted(&[&from]).unwrap();
@@ -81,14 +81,14 @@ fn no_pixel_is_empty_and_none_could_be_more() {
         };
         assert!(border(0.0) && !border(1.5), "{lens:?}: {w}x{h}");
         assert_eq!((to.focal, to.centre), ([(110.0_f64 * 112.0).sqrt(); 2], [0.5 * w, 0.5 * h]));
-        // Not more is lost than the corners that a pincushion pulls in.
+        // The loss is at most the corners that a pincushion pulls in.
         assert!(lens == barrel() || w * h > 0.75 * 160.0 * 120.0, "{lens:?}: {w}x{h}");
     }
 }
 
 #[test]
-fn the_picture_has_the_shape_that_keeps_most() {
-    // All that there is around a principal point that is far from the middle.
+fn undistorted_shape_keeps_the_most() {
+    // The principal point is far from the middle; the result covers everything around it.
     let aside = Camera { centre: [60.0, 61.5], focal: [110.0; 2], ..camera(Lens::Pinhole) };
     let to = Camera::undistorted(&[&aside]).unwrap();
     assert_eq!([to.width, to.height], [120, 117]);
@@ -106,7 +106,7 @@ fn the_picture_has_the_shape_that_keeps_most() {
 }
 
 #[test]
-fn a_fisheye_becomes_a_hundred_degrees_at_most() {
+fn undistorted_fisheye_is_100_degrees_at_most() {
     let from = Camera { width: 1000, height: 1000, focal: [300.0; 2], centre: [500.0; 2], ..camera(fisheye()) };
     let to = Camera::undistorted(&[&from]).unwrap();
     let angle = |side: usize| 2.0 * (0.5 * side as f64 / 300.0).atan().to_degrees();
@@ -114,7 +114,7 @@ fn a_fisheye_becomes_a_hundred_degrees_at_most() {
 }
 
 #[test]
-fn one_pinhole_serves_cameras_that_differ() {
+fn undistorted_camera_fits_different_cameras() {
     let (wide, tall) = (camera(barrel()), Camera { width: 120, height: 160, centre: [60.0, 80.0], ..camera(barrel()) });
     let both = Camera::undistorted(&[&wide, &tall]).unwrap();
     let each = [&wide, &tall].map(|camera| Camera::undistorted(&[camera]).unwrap());
@@ -132,12 +132,12 @@ fn one_pinhole_serves_cameras_that_differ() {
 }
 
 #[test]
-fn masks_are_carried_along_and_stay_black_or_white() {
+fn undistorted_masks_stay_black_or_white() {
     let folder = tempfile::tempdir().unwrap();
     let [image, mask] = ["photo.png", "mask.png"].map(|name| folder.path().join(name));
     let mut view = view(camera(barrel()), &image);
     taken(&view.camera, &image);
-    // Of half the size, black to the right of the middle.
+    // Half of the size, black to the right of the middle.
     let picture = image::GrayImage::from_fn(80, 60, |x, _| image::Luma([if x < 40 { 255 } else { 0 }]));
     picture.save(&mask).unwrap();
     view.mask = Some(mask);

@@ -11,7 +11,7 @@ fn document(names: &[&str]) -> Value {
     json!({ "camera_angle_x": 0.8, "frames": frames(names) })
 }
 
-/// A folder with two images of 8x6, `train/r_0.png` and `train/r_1.png`, and the training split after a change.
+/// A folder with the images `train/r_0.png` and `train/r_1.png` of 8x6 pixels, and a changed training split.
 fn folder(change: impl FnOnce(&mut Value)) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     picture(&folder.path().join("train/r_0.png"), 8, 6);
@@ -78,7 +78,7 @@ fn all_splits_are_read() {
 }
 
 #[test]
-fn sizes_are_those_of_the_file_or_of_the_first_image() {
+fn size_comes_from_the_file_or_the_first_image() {
     let sizes = |capture: Capture| capture.views.iter().map(|v| [v.camera.width, v.camera.height]).collect::<Vec<_>>();
     let folder = folder(|d| d["frames"] = frames(&["train/r_9", "train/r_0", "train/r_1"]));
     picture(&folder.path().join("train/r_1.png"), 5, 5);
@@ -92,7 +92,7 @@ fn sizes_are_those_of_the_file_or_of_the_first_image() {
 }
 
 #[test]
-fn names_may_carry_their_extension() {
+fn names_with_extension_are_read() {
     let folder = folder(|d| d["frames"] = frames(&["train/r_0.png", "train/r_1.5", "train/../train/r_1"]));
     std::fs::copy(folder.path().join("train/r_0.png"), folder.path().join("train/r_1.5.png")).unwrap();
     let capture = read(folder.path()).unwrap();
@@ -120,7 +120,7 @@ fn bad_fields_are_named() {
 }
 
 #[test]
-fn fields_of_other_programs_count() {
+fn fields_of_other_programs_are_read() {
     let of = |fields: Value| {
         good(|d| d.as_object_mut().unwrap().extend(fields.as_object().unwrap().clone())).views.remove(0).camera
     };
@@ -155,7 +155,7 @@ fn lego_is_read() {
     }
 }
 
-/// A capture of the folder with a view for each split.
+/// A capture with a view for each split.
 fn capture(folder: &Path) -> Capture {
     let view = |i: usize| {
         let image = folder.join(format!("images/r_{i}.png"));
@@ -176,7 +176,7 @@ fn capture(folder: &Path) -> Capture {
 }
 
 #[test]
-fn what_is_written_comes_back() {
+fn blender_writing_round_trips() {
     let folder = tempfile::tempdir().unwrap();
     let mut before = capture(folder.path());
     write(&before, folder.path()).unwrap();
@@ -189,7 +189,7 @@ fn what_is_written_comes_back() {
     assert_eq!(again, before);
     let document = json::read(&folder.path().join("transforms_val.json")).unwrap();
     assert_eq!(document["frames"][0]["file_path"], "./images/r_1", "other programs put .png behind it");
-    // Images of another kind keep their ending, and views without a split are for training.
+    // Other extensions stay, and views without a split become training views.
     let other = tempfile::tempdir().unwrap();
     before.views.iter_mut().for_each(|view| view.split = None);
     before.views[2].image = Some(folder.path().join("images/r_2.JPG"));
@@ -200,7 +200,7 @@ fn what_is_written_comes_back() {
 }
 
 #[test]
-fn what_has_no_place_in_the_format_is_named() {
+fn unsupported_views_are_errors() {
     let folder = tempfile::tempdir().unwrap();
     let before = capture(folder.path());
     let fails = |change: fn(&mut View), parts: &[&str]| {
@@ -227,7 +227,7 @@ fn what_has_no_place_in_the_format_is_named() {
 }
 
 #[test]
-fn damaged_files_are_errors_that_name_them() {
+fn damaged_blender_files_are_named() {
     let folder = folder(|_| {});
     let file = folder.path().join(FILE);
     let whole = [false, true].map(|sized| {

@@ -8,9 +8,9 @@ use crate::error::{Error, Result};
 use glam::DVec3;
 use std::path::Path;
 
-/// The place of an observation, and the point that is observed.
+/// The bytes of an observation: its position and the observed point.
 const OBSERVATION: usize = 8 + 8 + 8;
-/// An image that shows a point, and which of its observations does.
+/// The bytes of a track element: an image and the index of its observation.
 const TRACK_ELEMENT: usize = 4 + 4;
 /// The bytes of a camera with the fewest parameters.
 const LEAST_CAMERA: usize = 4 + 4 + 8 + 8 + 3 * 8;
@@ -19,15 +19,15 @@ const LEAST_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
 /// The bytes of a point that no image shows.
 const LEAST_POINT: usize = 8 + 3 * 8 + 3 + 8 + 8;
 
-/// What of a file is not read yet.
+/// The unread part of a file.
 struct Cursor<'a> {
     file: &'a Path,
     rest: &'a [u8],
 }
 
 impl<'a> Cursor<'a> {
-    /// The number of entries that the file announces. It is bounded by the bytes that are there, so that memory for it
-    /// may be taken at once.
+    /// Reads the number of entries of a list. The remaining bytes bound it, so that a damaged count cannot exhaust
+    /// memory.
     fn count(&mut self, list: &str, least: usize) -> Result<usize> {
         let bad = |what: String| Error::field(self.file, list, what);
         let Some((head, rest)) = self.rest.split_first_chunk() else {
@@ -78,7 +78,7 @@ impl<'a> Cursor<'a> {
         Ok(values)
     }
 
-    /// A text that ends in a zero byte.
+    /// Reads a text that ends in a zero byte.
     fn text(&mut self, place: Place, member: &str) -> Result<&'a str> {
         let end = self.rest.iter().position(|byte| *byte == 0).ok_or_else(|| self.ended(place, member))?;
         let (text, rest) = self.rest.split_at(end);
@@ -86,7 +86,7 @@ impl<'a> Cursor<'a> {
         std::str::from_utf8(text).map_err(|e| place.error(self.file, member, format!("is not UTF-8 text: {e}")))
     }
 
-    /// Passes over a list; its length.
+    /// Skips a list; returns its length.
     fn skip_list(&mut self, place: Place, member: &str, size: usize) -> Result<u64> {
         let count = self.u64(place, member)?;
         let bytes = usize::try_from(count).ok().and_then(|count| count.checked_mul(size));
@@ -149,7 +149,6 @@ pub(super) fn points(file: &Path, bytes: &[u8]) -> Result<Vec<Point>> {
     Ok(points)
 }
 
-/// The three files: cameras, images and points.
 pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {
     let (mut cameras, mut images, mut points) = (vec![], vec![], vec![]);
     let numbers = |out: &mut Vec<u8>, values: &[f64]| values.iter().for_each(|x| out.extend(x.to_le_bytes()));
@@ -167,7 +166,7 @@ pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {
         numbers(&mut images, &image.t);
         images.extend(image.camera.to_le_bytes());
         images.extend(image.name.as_bytes());
-        // The end of the name, and no observation.
+        // The terminator of the name, and a count of 0 observations.
         images.push(0);
         images.extend(0_u64.to_le_bytes());
     }

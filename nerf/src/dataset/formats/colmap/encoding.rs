@@ -12,7 +12,7 @@ pub enum Encoding {
 }
 
 impl Encoding {
-    /// Where a folder has both, the first is read.
+    /// The first has priority if a folder has both.
     pub(super) const ALL: [Encoding; 2] = [Encoding::Binary, Encoding::Text];
 
     pub(super) fn extension(self) -> &'static str {

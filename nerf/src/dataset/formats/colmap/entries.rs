@@ -7,12 +7,12 @@ use crate::error::{Error, Result};
 use glam::DAffine3;
 use std::path::Path;
 
-/// Where a file speaks of something.
+/// The position of an entry in a file, for errors.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Place {
-    /// An entry of a binary file: the list and the position in it.
+    /// An entry of a binary file: the list and the index.
     Item(&'static str, usize),
-    /// A line of a text, counted from 1.
+    /// A line of a text file, from 1.
     Line(usize),
 }
 
@@ -24,7 +24,7 @@ impl Place {
         }
     }
 
-    /// An error about a member of what is there.
+    /// An error about a member of the entry.
     pub(super) fn error(self, file: &Path, member: &str, what: impl ToString) -> Error {
         match self {
             Place::Item(..) => Error::field(file, format!("{}.{member}", self.name()), what),
@@ -33,7 +33,7 @@ impl Place {
     }
 }
 
-/// A camera of the file; its pose is the identity.
+/// A camera of the file, with the identity as its pose.
 pub(super) struct CameraEntry {
     pub(super) place: Place,
     pub(super) id: u32,
@@ -50,7 +50,7 @@ pub(super) struct ImageEntry {
 }
 
 impl ImageEntry {
-    /// `q` is the quaternion with its real part first.
+    /// `q` is a quaternion with the real part first.
     pub(super) fn new(
         file: &Path,
         place: Place,

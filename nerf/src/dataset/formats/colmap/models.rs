@@ -7,7 +7,7 @@ use crate::dataset::formats::limits::{MOST_PIXELS, start};
 use glam::DAffine3;
 use std::f64::consts::PI;
 
-/// Models that COLMAP has and we have not, from number 11 on.
+/// COLMAP's unsupported models, from number 11 on.
 const OTHERS: [&str; 7] = [
     "RAD_TAN_THIN_PRISM_FISHEYE",
     "SIMPLE_DIVISION",
@@ -18,7 +18,7 @@ const OTHERS: [&str; 7] = [
     "EQUIRECTANGULAR",
 ];
 
-/// The model of a number, or why there is none.
+/// The model with a number, or an error message.
 pub(super) fn by_id(id: i32) -> Result<&'static Model, String> {
     MODELS.iter().find(|model| model.id == Some(id)).ok_or_else(|| {
         let other = id.checked_sub(11).and_then(|i| usize::try_from(i).ok()).and_then(|i| OTHERS.get(i));
@@ -26,18 +26,18 @@ pub(super) fn by_id(id: i32) -> Result<&'static Model, String> {
     })
 }
 
-/// The model of a name, or why there is none.
+/// The model with a name, or an error message.
 pub(super) fn by_name(name: &str) -> Result<&'static Model, String> {
     Model::named(name).filter(|model| model.id.is_some()).ok_or_else(|| unsupported(&start(name)))
 }
 
-/// The names of the parameters of a model, in the order of the files.
+/// The names of a model's parameters, in the order of the files.
 pub(super) fn params(model: &Model) -> impl Iterator<Item = &'static str> {
     let focal: &[&str] = if model.single { &["f"] } else { &["fx", "fy"] };
     focal.iter().chain(&["cx", "cy"]).chain(model.coefficients).copied()
 }
 
-/// The camera with these parameters, its pose the identity; or which of them is wrong, and what with it.
+/// The camera with these parameters and the identity as its pose; as an error, the wrong parameter and a message.
 pub(super) fn camera(
     model: &Model,
     [width, height]: [u64; 2],
@@ -58,7 +58,7 @@ pub(super) fn camera(
         Lens::Fov { omega } if omega.abs() >= PI => {
             return Err(("omega", format!("must be below pi (radians), is {}", omega.abs())));
         }
-        // COLMAP's formula has the same value for both signs.
+        // COLMAP's formula is even in omega.
         Lens::Fov { omega } => Lens::Fov { omega: omega.abs() },
         lens => lens,
     };
@@ -71,7 +71,7 @@ fn unsupported(name: &str) -> String {
     format!("{name} is not supported (those from SIMPLE_PINHOLE to THIN_PRISM_FISHEYE are): {remedy}")
 }
 
-/// The lens, or a pinhole where that bends light the same way: without coefficients.
+/// Replaces a lens without distortion by an equal pinhole.
 fn simplest(lens: Lens) -> Lens {
     match lens {
         Lens::Brown { .. } | Lens::Fov { .. } if lens.coefficients().iter().all(|x| *x == 0.0) => Lens::Pinhole,
@@ -79,7 +79,7 @@ fn simplest(lens: Lens) -> Lens {
     }
 }
 
-/// The smallest model that holds a camera exactly, and its parameters; or why there is none.
+/// The smallest model that holds a camera exactly, and its parameters; or an error message.
 pub(super) fn model_of(camera: &Camera) -> Result<(&'static Model, Vec<f64>), String> {
     let lens = simplest(camera.lens);
     let Ok(model) = by_name(least(&lens, 2)) else {
@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn colmap_models_match_colmaps_list() {
-        // docs of COLMAP, "Camera Models", and the numbers of sensor/models.h.
+        // COLMAP's documentation, "Camera Models", and the numbers in sensor/models.h.
         let list = [
             (0, "SIMPLE_PINHOLE", 3),
             (1, "PINHOLE", 4),

@@ -2,16 +2,16 @@
 
 use glam::{DAffine3, DMat3, DQuat, DVec3, DVec4};
 
-/// The rotation of a quaternion of any length, its real part first; `None` if the length is 0.
+/// The rotation of a quaternion of any length with the real part first; `None` if the length is 0.
 fn rotation(q: [f64; 4]) -> Option<DMat3> {
     let q = DVec4::from_array(q);
-    // The largest becomes 1 first, so that no square underflows.
+    // Scaled to a maximum of 1 first, so that squares do not underflow.
     let largest = q.abs().max_element();
     let [w, x, y, z] = (largest > 0.0).then(|| (q / largest).normalize().to_array())?;
     Some(DMat3::from_quat(DQuat::from_xyzw(x, y, z, w)))
 }
 
-/// The pose of an image; or what is wrong, and with which of its members.
+/// The pose of an image; as an error, the wrong member and a message.
 pub(super) fn from_file(q: [f64; 4], t: [f64; 3]) -> Result<DAffine3, (&'static str, String)> {
     let Some(to_camera) = rotation(q) else {
         return Err(("qvec", "is a quaternion of length 0; use one of length 1".into()));
@@ -21,20 +21,20 @@ pub(super) fn from_file(q: [f64; 4], t: [f64; 3]) -> Result<DAffine3, (&'static 
     if !translation.is_finite() {
         return Err(("tvec", format!("is too large: {t:?}")));
     }
-    // From an image's axes, `y` down and `z` into the scene, to those of OpenGL.
+    // From COLMAP's image axes, `y` down and `z` into the scene, to OpenGL's.
     let matrix3 = DMat3::from_cols(to_world.x_axis, -to_world.y_axis, -to_world.z_axis);
     Ok(DAffine3 { matrix3, translation })
 }
 
-/// The quaternion, real part first and not negative, and the translation that COLMAP writes for a pose.
+/// COLMAP's quaternion and translation of a pose. The real part comes first and is not negative.
 pub(super) fn to_file(pose: &DAffine3) -> ([f64; 4], [f64; 3]) {
     let DMat3 { x_axis, y_axis, z_axis } = pose.matrix3;
     let q = DQuat::from_mat3(&DMat3::from_cols(x_axis, -y_axis, -z_axis).transpose()).normalize();
     let q = if q.w < 0.0 { -q } else { q };
     let q = [q.w, q.x, q.y, q.z];
-    // By the rotation that will be read, so that the rounding of the quaternion does not move the camera.
+    // Readers use the rounded quaternion, so the translation must too: otherwise the camera would move.
     let to_camera = rotation(q).unwrap_or(DMat3::IDENTITY);
-    // Adding zero leaves no negative zero.
+    // Adding zero turns a negative zero into a positive one.
     (q, (DVec3::ZERO - to_camera * pose.translation).to_array())
 }
 
@@ -45,7 +45,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn a_quarter_turn_has_the_sense_that_colmap_gives_it() {
+    fn quarter_turn_has_colmaps_sense() {
         // By +90 degrees about z: the world's x is the camera's y, which is down in the image.
         let s = 0.5_f64.sqrt();
         let pose = from_file([s, 0.0, 0.0, s], [1.0, 2.0, 3.0]).unwrap();
@@ -59,7 +59,7 @@ mod tests {
     }
 
     #[test]
-    fn lengths_do_not_matter_but_for_zero() {
+    fn quaternions_of_any_length_but_zero_are_read() {
         let pose = from_file([0.9, 0.1, -0.2, 0.3], [1.0, 2.0, 3.0]).unwrap();
         for scale in [1e-300, 1e-310, -1.0, 7.0, 1e300] {
             let other = from_file([0.9, 0.1, -0.2, 0.3].map(|x: f64| x * scale), [1.0, 2.0, 3.0]).unwrap();
@@ -72,7 +72,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_pose_comes_back(
+        fn poses_round_trip(
             q in prop::array::uniform4(-1.0..1.0_f64),
             eye in prop::array::uniform3(-1e3..1e3_f64),
         ) {
@@ -83,7 +83,7 @@ mod tests {
             let again = from_file(q, t).unwrap();
             prop_assert!(again.matrix3.abs_diff_eq(pose.matrix3, 4e-15), "{:?} {:?}", pose, again);
             prop_assert!(again.translation.abs_diff_eq(pose.translation, 4e-15 * (1.0 + pose.translation.length())));
-            // What looks at a point still does: the camera's -z is COLMAP's +z.
+            // The viewing direction is unchanged: the camera's -z is COLMAP's +z.
             let ahead = again.translation - 2.0 * pose.matrix3.z_axis;
             let seen = DMat3::from_quat(DQuat::from_xyzw(q[1], q[2], q[3], q[0])) * ahead + DVec3::from_array(t);
             prop_assert!(seen.abs_diff_eq(DVec3::new(0.0, 0.0, 2.0), 1e-11), "{}", seen);
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn half_turns_come_back() {
+    fn half_turns_round_trip() {
         for (up, eye) in [(DVec3::Y, DVec3::Z), (DVec3::Y, -DVec3::Z), (DVec3::Z, DVec3::X), (-DVec3::Z, DVec3::Y)] {
             let pose = Camera::look_at(eye, DVec3::ZERO, up);
             let (q, t) = to_file(&pose);

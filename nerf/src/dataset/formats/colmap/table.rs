@@ -26,7 +26,7 @@ pub(super) struct ImageRow<'a> {
     pub name: &'a str,
 }
 
-/// What both encodings write.
+/// The common content of both encodings.
 pub(super) struct Table<'a> {
     pub cameras: Vec<CameraRow>,
     pub images: Vec<ImageRow<'a>>,
@@ -72,31 +72,31 @@ impl<'a> Table<'a> {
 }
 
 impl CameraRow {
-    /// The row of a camera, without its number; or why there is none.
+    /// The row of a camera, without its number; or an error message.
     fn new(camera: &Camera) -> std::result::Result<Self, String> {
         let (model, params) = model_of(camera)?;
         let size = [camera.width as u64, camera.height as u64];
         if let Some((name, value)) = models::params(model).zip(&params).find(|(_, value)| !value.is_finite()) {
             return Err(format!("{name}: must be a finite number, is {value}"));
         }
-        // What could not be read again is not written.
+        // The reader's checks: a written camera must be readable.
         models::camera(model, size, &params).map_err(|(member, what)| format!("{member}: {what}"))?;
         Ok(CameraRow { id: 0, model, size, params })
     }
 
-    /// What rows share that may be one.
+    /// Cameras with equal keys share a row.
     fn key(&self) -> (&'static str, [u64; 2], Vec<u64>) {
         (self.model.name, self.size, self.params.iter().map(|param| param.to_bits()).collect())
     }
 }
 
-/// What keeps a name from being written such that it is read again.
+/// Checks that a written name can be read again.
 fn check_name(view: &View, encoding: Encoding) -> std::result::Result<(), String> {
     let name = &view.name;
     if name.is_empty() || name.starts_with("./") || name.contains(char::is_control) || name.trim() != name {
         return Err(format!("{name:?} is not a valid image name: rename the file"));
     }
-    // We could read it, but COLMAP ends a name at its first space.
+    // raygrad could read it, but COLMAP ends a name at its first space.
     if encoding == Encoding::Text && name.contains(char::is_whitespace) {
         return Err(format!("`{name}` has a space, which COLMAP's text files do not support: write binary files"));
     }

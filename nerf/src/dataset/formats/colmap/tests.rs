@@ -7,7 +7,7 @@ mod damaged;
 mod reference;
 mod round_trip;
 
-/// Bytes as COLMAP's documentation lays them out.
+/// Bytes in the layout of COLMAP's documentation.
 #[derive(Default)]
 pub(super) struct Bytes(pub Vec<u8>);
 
@@ -30,7 +30,7 @@ impl Bytes {
     }
 }
 
-/// Cameras, images and points: two cameras, two images and two points, with numbers that binary fractions hold.
+/// Cameras, images and points: two of each, with numbers that are exact in binary.
 pub(super) fn binary() -> [Vec<u8>; 3] {
     let cameras = Bytes::default().u64(2);
     let cameras = cameras.u32(7).u32(1).u64(640).u64(480).f64s(&[500.5, 501.5, 320.25, 240.75]);
@@ -46,7 +46,7 @@ pub(super) fn binary() -> [Vec<u8>; 3] {
     [cameras.0, images.0, points.0]
 }
 
-/// The same, as text.
+/// The same as text.
 pub(super) const TEXT: [&str; 3] = [
     "# Camera list\n7 PINHOLE 640 480 500.5 501.5 320.25 240.75\n\n9 SIMPLE_RADIAL 100 80 90 50 40 -0.125\n",
     "# Image list\n# with two lines each\n3 0.5 0.5 0.5 0.5 1 2 3 9 b/second.png\n10.5 11.5 1 12.5 13.5 -1 \n\
@@ -58,7 +58,7 @@ pub(super) fn text() -> [Vec<u8>; 3] {
     TEXT.map(|text| text.as_bytes().to_vec())
 }
 
-/// A capture's folder with these files in `place`.
+/// A capture's folder with these files in the folder `place`.
 pub(super) fn folder(encoding: Encoding, place: &str, files: &[Vec<u8>; 3]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     fs::create_dir_all(folder.path().join(place)).unwrap();
@@ -68,21 +68,21 @@ pub(super) fn folder(encoding: Encoding, place: &str, files: &[Vec<u8>; 3]) -> t
     folder
 }
 
-/// What the fixture says, worked out by hand.
+/// Compares with the content of the fixture, worked out by hand.
 #[track_caller]
 fn is_the_fixture(capture: &Capture) {
     let [a, b] = &capture.views[..] else { panic!("{} views", capture.views.len()) };
     assert_eq!((a.name.as_str(), b.name.as_str()), ("a.png", "b/second.png"));
-    // Four units behind the origin, and looks at it, with the image's up the world's -y.
+    // Four units behind the origin, looking at it; up in the image is -y of the world.
     let pose =
         DAffine3 { matrix3: DMat3::from_cols(DVec3::X, -DVec3::Y, -DVec3::Z), translation: DVec3::new(0.0, 0.0, -4.0) };
     let pinhole =
         Camera { width: 640, height: 480, focal: [500.5, 501.5], centre: [320.25, 240.75], lens: Lens::Pinhole, pose };
     assert_eq!(a.camera, pinhole);
-    // In the middle of the axis, and up and to the left of it.
+    // The origin is on the optical axis; the other point is up and to the left of it.
     assert_eq!(a.camera.pixel_of(DVec3::ZERO), Some([320.25, 240.75]));
     assert_eq!(a.camera.pixel_of(DVec3::new(-4.0, -2.0, 0.0)), Some([320.25 - 500.5, 240.75 - 0.5 * 501.5]));
-    // The quaternion turns x to y, y to z and z to x: the camera's axes are the world's y, z, x.
+    // The quaternion maps x to y, y to z and z to x, so the camera's axes are the world's y, z, x.
     let pose = DAffine3 {
         matrix3: DMat3::from_cols(DVec3::Z, -DVec3::X, -DVec3::Y),
         translation: DVec3::new(-2.0, -3.0, -1.0),
@@ -100,7 +100,7 @@ fn is_the_fixture(capture: &Capture) {
 }
 
 #[test]
-fn both_encodings_say_what_they_say_wherever_they_are() {
+fn both_encodings_are_read_from_all_folders() {
     for (encoding, files) in [(Encoding::Binary, binary()), (Encoding::Text, text())] {
         for place in PLACES {
             let folder = folder(encoding, place, &files);
@@ -117,7 +117,7 @@ fn both_encodings_say_what_they_say_wherever_they_are() {
 }
 
 #[test]
-fn entries_are_named_by_where_they_are() {
+fn fields_are_list_indices_or_lines() {
     let fields = |encoding, files| {
         let capture = read(folder(encoding, "sparse/0", &files).path()).unwrap();
         capture.views.into_iter().map(|view| view.field).collect::<Vec<_>>()
@@ -134,7 +134,7 @@ fn colmap_binary_comes_first_rigs_are_skipped() {
         fs::write(model.join(file), "?").unwrap();
     }
     is_the_fixture(&read(folder.path()).unwrap());
-    // Points are no part that a model must have.
+    // The points file is optional.
     fs::remove_file(model.join("points3D.bin")).unwrap();
     assert_eq!(read(folder.path()).unwrap().points, []);
 }
@@ -163,12 +163,12 @@ fn images_and_masks_are_found() {
     assert_eq!(found(root), [[Some(a), Some(mask_a)], [Some(b), Some(mask_b)]]);
     let mask_a = touch("masks/a.png.png");
     assert_eq!(found(root)[0][1], Some(mask_a), "COLMAP's own name comes first");
-    // The folder of the model itself was asked for.
+    // Reading the folder of the model finds the same files.
     let from_model = found(&root.join("sparse/0"));
     assert!(from_model.iter().flatten().all(Option::is_some), "{from_model:?}");
 }
 
-/// Reads the fixture with one file replaced, and expects this error of the file.
+/// Reads the fixture with one file replaced and expects an error about that file.
 #[track_caller]
 pub(super) fn fails(encoding: Encoding, which: usize, bytes: &[u8], field: &str, expected: &str) {
     let mut files = match encoding {
@@ -228,7 +228,8 @@ fn binary_errors_name_the_entry() {
         bytes[at..at + new.len()].copy_from_slice(new);
         bytes
     };
-    // The second camera begins after 8 + 24 + 32 bytes: number, model, width, height, parameters.
+    // The second camera begins after 8 + 24 + 32 bytes: the count, and the number, model, width, height and parameters
+    // of the first.
     let second = 64;
     fails(Binary, 0, &with(&cameras, second, &[7]), "`cameras[1].camera_id`", "is `7`, as that of cameras[0] is");
     let model = |id: u32, expected| {
@@ -245,7 +246,7 @@ fn binary_errors_name_the_entry() {
     fails(Binary, 0, &with(&cameras, second + 24, &[0; 8]), "`cameras[1].focal length`", "must be more than 0, is 0");
     fails(Binary, 0, &cameras[..cameras.len() - 1], "`cameras[1].k1`", "the file ends here");
     fails(Binary, 0, &cameras[..5], "`cameras`", "the file ends before their number");
-    // Counts that no memory could hold, and one that just is not there.
+    // Counts that no memory could hold, and one that is just beyond the end.
     for count in [u64::MAX, 1 << 60, 1 << 33, 3] {
         for (which, bytes, list) in [(0, &cameras, "`cameras`"), (1, &images, "`images`"), (2, &points, "`points3D`")] {
             fails(Binary, which, &with(bytes, 0, &count.to_le_bytes()), list, &format!("announces {count} entries"));
@@ -268,16 +269,16 @@ fn binary_errors_name_the_entry() {
     fails(Binary, 2, &with(&points, 16, &f64::NAN.to_le_bytes()), "`points3D[0].xyz`", "finite");
     fails(Binary, 2, &with(&points, 43, &f64::NAN.to_le_bytes()), "`points3D[0].error`", "finite");
     fails(Binary, 2, &with(&points, 51, &[200]), "`points3D[0].track`", "announces 200 entries");
-    // Bytes after the end are no fault.
+    // Bytes after the end are ignored.
     let mut longer = binary();
     longer.iter_mut().for_each(|bytes| bytes.extend([1, 2, 3]));
     is_the_fixture(&read(folder(Binary, "sparse", &longer).path()).unwrap());
 }
 
 #[test]
-fn what_people_write_by_hand_is_read() {
+fn hand_written_text_files_are_read() {
     let mut files = text();
-    // Ends of lines of Windows, names with spaces and dots, a mark of the order of bytes, no last empty line.
+    // Windows line ends, names with spaces and dots, a byte-order mark, and no empty last line.
     files[1] = "\u{feff}# images\r\n5 -1 0 0 0 0 0 4 7 ./dir/my image (1).png\r\n\r\n6\t1 0 0 0 0 0 4 7 b.png".into();
     let views = read(folder(Encoding::Text, "sparse", &files).path()).unwrap().views;
     assert_eq!(views.iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["b.png", "dir/my image (1).png"]);

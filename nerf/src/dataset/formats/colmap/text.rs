@@ -11,7 +11,7 @@ use std::fmt::Write;
 use std::path::Path;
 use std::str::FromStr;
 
-/// What of a line is not read yet.
+/// The unread part of a line.
 struct Words<'a> {
     file: &'a Path,
     place: Place,
@@ -30,7 +30,7 @@ impl<'a> Words<'a> {
         if word.is_empty() { Err(self.error(member, "is missing")) } else { Ok(word) }
     }
 
-    /// A whole number.
+    /// Reads an integer.
     fn integer<T: FromStr>(&mut self, member: &str) -> Result<T> {
         let word = self.word(member)?;
         word.parse().map_err(|_| {
@@ -56,14 +56,14 @@ impl<'a> Words<'a> {
     }
 }
 
-/// The lines of a file with their numbers, from 1.
+/// The lines of a file, numbered from 1.
 fn lines<'a>(file: &'a Path, bytes: &'a [u8]) -> Result<impl Iterator<Item = Words<'a>>> {
     let text = std::str::from_utf8(bytes).map_err(|e| Error::file(file, format!("is not UTF-8 text: {e}")))?;
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     Ok((1..).zip(text.lines()).map(move |(line, rest)| Words { file, place: Place::Line(line), rest: rest.trim() }))
 }
 
-/// Whether a line has something to say.
+/// Returns true unless a line is empty or a comment.
 fn speaks(line: &Words<'_>) -> bool {
     !line.rest.is_empty() && !line.rest.starts_with('#')
 }
@@ -93,9 +93,9 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
         let id = line.integer("IMAGE_ID")?;
         let (q, t) = (line.numbers("QVEC")?, line.numbers("TVEC")?);
         let camera = line.integer("CAMERA_ID")?;
-        // The rest of the line: a name may have spaces.
+        // The name is the rest of the line, since it may contain spaces.
         images.push(ImageEntry::new(file, line.place, id, q, t, camera, line.rest.trim())?);
-        // The next line belongs to the image, whatever it holds, and often it is empty.
+        // The next line holds the image's observations, also if it is empty.
         if let Some(line) = lines.next() {
             observations(&line)?;
         }
@@ -103,8 +103,8 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
     Ok(images)
 }
 
-/// Checks that a line holds observations. If an empty one is missing, the next image is in its place, and must not be
-/// lost silently.
+/// Checks that a line holds observations. If an empty line is missing, the next image stands there; it must not be lost
+/// silently.
 fn observations(line: &Words<'_>) -> Result<()> {
     let (mut count, mut last) = (0, "-1");
     for word in line.rest.split_whitespace() {
@@ -132,7 +132,6 @@ pub(super) fn points(file: &Path, bytes: &[u8]) -> Result<Vec<Point>> {
     lines(file, bytes)?.filter(speaks).map(point).collect()
 }
 
-/// The three files: cameras, images and points.
 pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {
     let mut cameras = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".to_owned();
     let mut images =
@@ -140,7 +139,7 @@ pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {
     let mut points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n".to_owned();
     let numbers = |out: &mut String, values: &[f64]| {
         for value in values {
-            // As few digits as bring every bit back. Writing to a string cannot fail.
+            // `{:?}` prints the fewest digits that keep every bit. Writing to a string cannot fail.
             let _ = write!(out, " {value:?}");
         }
     };
@@ -153,7 +152,7 @@ pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {
         let _ = write!(images, "{}", image.id);
         numbers(&mut images, &image.q);
         numbers(&mut images, &image.t);
-        // And the empty line of an image without observations.
+        // The empty line holds the observations of the image.
         let _ = write!(images, " {} {}\n\n", image.camera, image.name);
     }
     for (id, point) in (1_u64..).zip(table.points) {

@@ -7,12 +7,12 @@ use std::f64::consts::PI;
 
 const FILE: &str = "transforms.json";
 
-/// Two frames and a pinhole whose numbers all differ.
+/// Two frames and a pinhole with distinct numbers.
 fn document() -> Value {
     json!({ "fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48, "frames": frames(&["0", "1"]) })
 }
 
-/// The cameras after a change to the document.
+/// Reads the cameras of a changed document.
 fn read(change: impl FnOnce(&mut Value)) -> crate::Result<Vec<Camera>> {
     let (folder, mut document) = (tempfile::tempdir().unwrap(), document());
     change(&mut document);
@@ -36,7 +36,7 @@ fn set(object: &mut Value, fields: &Value) {
     object.as_object_mut().unwrap().extend(fields.as_object().unwrap().clone());
 }
 
-/// What the camera is of a file with these fields at the top, and of a frame with them whose file has others.
+/// The camera of a file with these fields at the top; it must equal that of a frame with them in a file with others.
 #[track_caller]
 fn with(fields: Value) -> Camera {
     let top = cameras(|document| set(document, &fields));
@@ -48,7 +48,7 @@ fn with(fields: Value) -> Camera {
 }
 
 #[test]
-fn every_number_of_a_pinhole_counts() {
+fn all_pinhole_numbers_are_read() {
     let plain = cameras(|_| {})[0].clone();
     assert_eq!((plain.width, plain.height, plain.focal, plain.centre), (64, 48, [100.0, 110.0], [31.0, 25.0]));
     assert_eq!((plain.lens, plain.pose.translation.z), (Lens::Pinhole, 4.0));
@@ -57,13 +57,13 @@ fn every_number_of_a_pinhole_counts() {
     assert_eq!(with(json!({ "cy": 30.25 })), Camera { centre: [31.0, 30.25], ..plain.clone() });
     assert_eq!(with(json!({ "w": 128.0 })), Camera { width: 128, ..plain.clone() });
     assert_eq!(with(json!({ "h": 96 })), Camera { height: 96, ..plain.clone() });
-    // Without a principal point it is the middle, of each axis for itself.
+    // Each axis of the principal point defaults to the middle separately.
     assert_eq!(cameras(|d| remove(d, "cx"))[0].centre, [32.0, 25.0]);
     assert_eq!(cameras(|d| remove(d, "cy"))[0].centre, [31.0, 24.0]);
 }
 
 #[test]
-fn angles_stand_where_focal_lengths_are_absent() {
+fn angles_replace_absent_focal_lengths() {
     let of = |angle: f64, side: f64| 0.5 * side / (0.5 * angle).tan();
     let angles = json!({ "camera_angle_x": 0.8, "camera_angle_y": 0.7 });
     let without = |d: &mut Value, names: &[&str]| names.iter().for_each(|name| remove(d, name));
@@ -78,7 +78,7 @@ fn angles_stand_where_focal_lengths_are_absent() {
     assert_eq!(focal(&["fl_x"]), [of(0.8, 64.0), 110.0]);
     assert_eq!(focal(&["fl_y"]), [100.0, of(0.7, 48.0)]);
     assert_eq!(focal(&["fl_x", "fl_y"]), [of(0.8, 64.0), of(0.7, 48.0)]);
-    // One alone counts for both.
+    // A single angle counts for both axes.
     for (angle, side) in [("camera_angle_x", 64.0), ("camera_angle_y", 48.0)] {
         let cameras = cameras(|d| {
             without(d, &["fl_x", "fl_y"]);
@@ -88,7 +88,7 @@ fn angles_stand_where_focal_lengths_are_absent() {
     }
     assert_eq!(cameras(|d| remove(d, "fl_y"))[0].focal, [100.0; 2]);
     assert_eq!(cameras(|d| remove(d, "fl_x"))[0].focal, [110.0; 2]);
-    // A frame's angle comes before the file's focal length.
+    // A frame's angle has priority over the file's focal length.
     let own = cameras(|d| set(&mut d["frames"][1], &angles));
     assert_eq!([own[0].focal, own[1].focal], [[100.0, 110.0], [of(0.8, 64.0), of(0.7, 48.0)]]);
     let own = cameras(|d| {
@@ -102,7 +102,7 @@ fn angles_stand_where_focal_lengths_are_absent() {
 }
 
 #[test]
-fn every_lens_coefficient_counts() {
+fn all_lens_coefficients_are_read() {
     let brown = |k: [f64; 6], p: [f64; 2]| Lens::Brown { k, p };
     let fisheye = |k: [f64; 4], p: [f64; 2], s: [f64; 2]| Lens::Fisheye { k, p, s };
     let zero = [0.0; 2];
@@ -161,7 +161,7 @@ fn every_lens_coefficient_counts() {
             }
         }
     }
-    // Without a name.
+    // Without a model name.
     let lens = with(json!({ "k1": 0.1, "k2": -0.2, "p1": 0.01, "p2": 0.02 })).lens;
     assert_eq!(lens, brown([0.1, -0.2, 0.0, 0.0, 0.0, 0.0], [0.01, 0.02]));
     assert_eq!(with(json!({ "k1": 0, "k2": 0.0, "p1": 0, "p2": 0, "k3": 0, "k4": 0 })).lens, Lens::Pinhole);
@@ -176,7 +176,7 @@ fn every_lens_coefficient_counts() {
 }
 
 #[test]
-fn instant_ngp_says_that_a_lens_is_a_fisheye() {
+fn is_fisheye_selects_the_fisheye_model() {
     let fisheye = Lens::Fisheye { k: [0.1, 0.2, 0.3, 0.4], p: [0.0; 2], s: [0.0; 2] };
     let k = json!({ "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "is_fisheye": true });
     assert_eq!(with(k.clone()).lens, fisheye);
@@ -212,7 +212,7 @@ fn unknown_models_are_named() {
 }
 
 #[test]
-fn panoramas_show_all_directions() {
+fn panorama_covers_all_directions() {
     let panorama = |fields: Value| {
         move |d: &mut Value| {
             *d = json!({ "camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32, "frames": d["frames"].clone() });
@@ -238,13 +238,13 @@ fn panoramas_show_all_directions() {
         );
     }
     fails(panorama(json!({ "k1": 0.1 })), &["`k1`", "EQUIRECTANGULAR has no such"]);
-    // Axes for themselves.
+    // Each axis scales separately.
     let wide = cameras(panorama(json!({ "h": 16 })))[0].clone();
     assert_eq!(wide.focal, [32.0 / PI, 16.0 / PI]);
 }
 
 #[test]
-fn fields_that_cannot_be_followed_are_named() {
+fn unsupported_camera_fields_are_named() {
     for (name, value, hint) in [
         ("x_fov", json!(45.8), "camera_angle_x"),
         ("y_fov", json!(45.8), "camera_angle_y"),
@@ -267,7 +267,7 @@ fn fields_that_cannot_be_followed_are_named() {
 }
 
 #[test]
-fn numbers_that_are_none_are_named() {
+fn invalid_camera_numbers_are_named() {
     for name in ["fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "p2"] {
         for value in ["NaN", "Infinity", "-Infinity", "[1]", "\"1\"", "{}", "1e999"] {
             let (folder, mut document) = (tempfile::tempdir().unwrap(), document());
@@ -300,7 +300,7 @@ fn numbers_that_are_none_are_named() {
 }
 
 #[test]
-fn sizes_that_are_not_given_are_those_of_the_images() {
+fn missing_sizes_come_from_the_images() {
     let folder = tempfile::tempdir().unwrap();
     let mut document = json!({ "camera_angle_x": 0.8, "frames": frames(&["a", "0.png", "1.png", "2"]) });
     let read = |document: &Value| {

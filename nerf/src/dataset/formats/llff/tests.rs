@@ -4,8 +4,8 @@ use proptest::prelude::*;
 use raygrad_test_support::damage::{clear, damage, damaged};
 use std::fs;
 
-/// Two rows by hand: a camera at (1, 2, 3) that looks along the world's -z with +y up, and one at (0, 0, 5) that looks
-/// along -x with +z up.
+/// Two rows by hand. One camera is at (1, 2, 3) and looks along -z of the world with +y up. The other is at (0, 0, 5)
+/// and looks along -x with +z up.
 #[rustfmt::skip]
 const ROWS: [[f64; COLUMNS]; 2] = [
     [0.0, 1.0, 0.0, 1.0, 30.0,
@@ -16,7 +16,7 @@ const ROWS: [[f64; COLUMNS]; 2] = [
      -1.0, 0.0, 0.0, 5.0, 55.5, 2.5, 9.0],
 ];
 
-/// A file as NumPy writes it.
+/// A file in NumPy's encoding.
 fn npy(rows: &[[f64; COLUMNS]]) -> Vec<u8> {
     let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, 17), }}\n", rows.len());
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
@@ -37,7 +37,7 @@ fn folder(bytes: &[u8], images: &[&str]) -> tempfile::TempDir {
     folder
 }
 
-/// The images of two rows, and what is none.
+/// The images of two rows, and entries that are not images.
 const IMAGES: [&str; 4] = ["images/b.JPG", "images/a.png", "images/notes.txt", "images/c.png/x"];
 
 #[test]
@@ -54,13 +54,13 @@ fn llff_rows_follow_image_names() {
     assert_eq!(a.camera, expected);
     let pose = Camera::look_at(DVec3::new(0.0, 0.0, 5.0), DVec3::new(-9.0, 0.0, 5.0), DVec3::Z);
     assert_eq!(b.camera, Camera { pose, ..expected });
-    // Right and above of the axis.
+    // The point is to the right of the axis and above it.
     assert_eq!(a.camera.pixel_of(DVec3::new(2.0, 4.0, 2.0)), Some([20.0 + 55.5, 15.0 - 111.0]));
     assert_eq!((capture.format, capture.file), (Format::Llff, folder.path().join(FILE)));
 }
 
 #[test]
-fn reduced_images_stand_in_for_absent_ones() {
+fn reduced_images_replace_absent_ones() {
     let all =
         folder(&npy(&ROWS), &["images_8/0.png", "images_8/1.png", "images_4/2.png", "images_4/3.png", "images_x/y"]);
     assert_eq!(read(all.path()).unwrap().views[0].name, "2.png", "the least reduced");
@@ -72,7 +72,7 @@ fn reduced_images_stand_in_for_absent_ones() {
 }
 
 #[test]
-fn errors_name_the_row() {
+fn llff_errors_name_the_row() {
     let fails_as = |bytes: &[u8], expected: &str| {
         let message = read(folder(bytes, &IMAGES).path()).unwrap_err().to_string();
         assert!(message.contains(FILE) && message.contains(expected), "{message}");
@@ -102,9 +102,9 @@ fn errors_name_the_row() {
 }
 
 #[test]
-fn what_is_written_comes_back_bit_for_bit() {
+fn llff_round_trip_is_exact() {
     let mut rows = ROWS;
-    // As long as files of NumPy's float32 may make it, and kept as it is.
+    // The length that NumPy's float32 rounding may give; it is kept.
     rows[1][2] = 1.0 + 1.0 / 3000.0;
     let before = read(folder(&npy(&rows), &IMAGES).path()).unwrap();
     let other = folder(b"", &IMAGES);
@@ -116,13 +116,13 @@ fn what_is_written_comes_back_bit_for_bit() {
     assert_eq!(said(&before), said(&after));
     let bits = |bytes: &[u8]| Matrix::read(bytes).unwrap().values;
     let mut whole = bits(&npy(&rows));
-    // Sides are whole pixels in a camera.
+    // A camera's sides are whole pixels.
     [9, 26].into_iter().for_each(|i| whole[i] = 40.0);
     assert_eq!(bits(&fs::read(other.path().join(FILE)).unwrap()), whole);
 }
 
 #[test]
-fn what_cannot_be_written_is_named() {
+fn unwritable_llff_captures_are_named() {
     let fails = |change: &dyn Fn(&mut Capture), expected: &str| {
         let mut capture = read(folder(&npy(&ROWS), &IMAGES).path()).unwrap();
         change(&mut capture);
@@ -157,7 +157,7 @@ proptest! {
     #![proptest_config(cases(1000))]
 
     #[test]
-    fn damaged_files(damage in damage()) {
+    fn damaged_llff_files_are_named_or_sound(damage in damage()) {
         let images = ["a.png", "b.png"].map(|name| (name.to_owned(), PathBuf::from(name))).to_vec();
         match parse(Path::new("x"), &damaged(&npy(&ROWS), &npy(&ROWS[..1]), &damage), images) {
             Ok(capture) => for View { camera, bounds, .. } in &capture.views {

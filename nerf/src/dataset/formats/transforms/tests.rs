@@ -11,7 +11,7 @@ fn document() -> Value {
     json!({ "fl_x": 10.0, "w": 8, "h": 6, "frames": frames(&["./images/0.png", "images/1.png", "images/2.png"]) })
 }
 
-/// A folder with the first two images, and the document after a change.
+/// A folder with the first two images, and a changed document.
 fn folder(change: impl FnOnce(&mut Value)) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     picture(&folder.path().join("images/0.png"), 8, 6);
@@ -35,13 +35,13 @@ fn fails(change: impl FnOnce(&mut Value), parts: &[&str]) {
 }
 
 #[test]
-fn a_folder_is_recognised() {
+fn detect_needs_the_transforms_file() {
     assert!(detect(folder(|_| {}).path()));
     assert!(!detect(tempfile::tempdir().unwrap().path()));
 }
 
 #[test]
-fn views_are_in_order_and_know_where_they_are() {
+fn views_keep_file_order_and_their_field() {
     let folder = folder(|_| {});
     let capture = read(folder.path()).unwrap();
     let names: Vec<_> = capture.views.iter().map(|view| (view.name.as_str(), view.field.as_str())).collect();
@@ -55,12 +55,12 @@ fn views_are_in_order_and_know_where_they_are() {
 }
 
 #[test]
-fn poses_are_as_they_are_given() {
+fn poses_are_read_unchanged() {
     let turned = json!([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]]);
     let capture = good(|d| d["frames"][1]["transform_matrix"] = turned);
     let pose = capture.views[1].camera.pose;
     assert_eq!((pose.translation, pose.matrix3.x_axis), (DVec3::new(1.0, 2.0, 3.0), DVec3::Y));
-    // instant-ngp's cube is no matter of the cameras.
+    // instant-ngp's cube does not change the cameras.
     let other = good(|d| {
         (d["scale"], d["offset"], d["aabb"]) = (json!(0.5), json!([0.1, 0.2, 0.3]), json!([[0, 0, 0], [2, 2, 2]]));
     });
@@ -68,7 +68,7 @@ fn poses_are_as_they_are_given() {
 }
 
 #[test]
-fn a_pose_that_is_none_is_named() {
+fn invalid_poses_are_named() {
     let bad = |value: Value, part: &str| {
         fails(|d| d["frames"][1]["transform_matrix"] = value, &["`frames[1].transform_matrix`: ", part]);
     };
@@ -103,7 +103,7 @@ fn a_pose_that_is_none_is_named() {
 }
 
 #[test]
-fn documents_that_are_none_are_located() {
+fn invalid_documents_are_located() {
     let of = |text: &str| {
         let folder = folder(|_| {});
         std::fs::write(folder.path().join(FILE), text).unwrap();
@@ -122,7 +122,7 @@ fn documents_that_are_none_are_located() {
 }
 
 #[test]
-fn images_are_found_however_their_path_is_written() {
+fn images_are_found_by_all_path_styles() {
     for path in ["images/0.png", "./images/0.png", ".\\images\\0.png", "images/0", "images/0.PNG"] {
         let folder = folder(|d| d["frames"][0]["file_path"] = json!(path));
         let view = &read(folder.path()).unwrap().views[0];
@@ -143,7 +143,7 @@ fn masks_depths_and_sharpness_are_read() {
         let own = json!({ "mask_path": "masks/0.png", "depth_file_path": "depth/0.png", "sharpness": 31.5 });
         d["frames"][0].as_object_mut().unwrap().extend(own.as_object().unwrap().clone());
         d["frames"][1]["depth_file_path"] = json!(".\\depth\\1.npy");
-        // Of an absent image.
+        // A mask of an absent image.
         d["frames"][2]["mask_path"] = json!("masks/2.png");
     });
     let at = |name: &str| folder.path().join(name);
@@ -210,10 +210,10 @@ fn lists_of_names_are_splits() {
 }
 
 #[test]
-fn the_transform_before_and_its_scale_are_combined() {
+fn applied_transform_includes_its_scale() {
     let applied =
         |fields: Value| good(|d| d.as_object_mut().unwrap().extend(fields.as_object().unwrap().clone())).applied;
-    // nerfstudio's, from COLMAP's axes.
+    // nerfstudio's matrix from COLMAP's axes.
     let three = json!([[1, 0, 0, 0.5], [0, 0, 1, 0], [0, -1, 0, 0]]);
     let mut four = three.clone();
     four.as_array_mut().unwrap().push(json!([0, 0, 0, 1]));
@@ -231,7 +231,7 @@ fn the_transform_before_and_its_scale_are_combined() {
 }
 
 #[test]
-fn the_box_is_read_and_harmless_fields_pass() {
+fn aabb_scale_is_read_other_fields_are_ignored() {
     assert_eq!(good(|d| d["aabb_scale"] = json!(4)).aabb_scale, Some(4.0));
     fails(|d| d["aabb_scale"] = json!(-4), &["`aabb_scale`: must be above 0, is -4"]);
     fails(|d| d["aabb_scale"] = json!([4]), &["`aabb_scale`: must be a finite number"]);
@@ -269,7 +269,7 @@ fn the_fox_is_read() {
 }
 
 #[test]
-fn damaged_files_are_errors_that_name_them() {
+fn damaged_transforms_files_are_named() {
     let folder = folder(|d| {
         d["train_filenames"] = json!(["images/0.png"]);
         d["applied_transform"] = json!([[1, 0, 0, 0.5], [0, 0, 1, 0], [0, -1, 0, 0]]);

@@ -1,11 +1,11 @@
-//! Damaged files are an error, or a capture that is sound; never a panic.
+//! A damaged file gives an error or a sound capture, never a panic.
 
 use super::*;
 use crate::dataset::formats::{cases, rigid};
 use proptest::prelude::*;
 use raygrad_test_support::damage::{Damage, clear, damage, damaged};
 
-/// The fixture with one of its files damaged, without a disk.
+/// Parses the fixture in memory with one file damaged.
 fn parsed(encoding: Encoding, which: usize, damage: &[Damage]) -> Result<Capture> {
     let mut files = match encoding {
         Encoding::Binary => binary(),
@@ -20,7 +20,7 @@ proptest! {
     #![proptest_config(cases(2000))]
 
     #[test]
-    fn files(damage in damage(), which in 0..3_usize, is_text: bool) {
+    fn damaged_colmap_files_are_named_or_sound(damage in damage(), which in 0..3_usize, is_text: bool) {
         let encoding = if is_text { Encoding::Text } else { Encoding::Binary };
         match parsed(encoding, which, &damage) {
             Ok(capture) => for view in &capture.views {
@@ -29,7 +29,7 @@ proptest! {
                 prop_assert!(camera.focal.iter().chain(&camera.centre).all(|x| x.is_finite()), "{:?}", camera);
                 prop_assert!(camera.focal[0] > 0.0 && camera.focal[1] > 0.0 && camera.width * camera.height > 0);
             },
-            // Two files may be at fault where numbers of one are those of the other.
+            // An error may name another file, since files refer to numbers of others.
             Err(error) => clear(error, &format!(".{}", encoding.extension())),
         }
     }

@@ -1,4 +1,4 @@
-//! Against COLMAP itself: `tests/reference/colmap.py` wrote the files, and the pixels at which COLMAP sees points.
+//! Comparison with COLMAP: `tests/reference/colmap.py` wrote the files and COLMAP's projections of points.
 
 use super::*;
 use serde_json::Value;
@@ -11,7 +11,7 @@ fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect()
 }
 
-/// Where a camera shows a point, by the formulas of COLMAP's documentation.
+/// The projection of a point, by the formulas of COLMAP's documentation.
 fn pixel(camera: &Camera, point: DVec3) -> [f64; 2] {
     let local = camera.pose.matrix3.transpose() * (point - camera.pose.translation);
     let (x, y) = (local.x / -local.z, -local.y / -local.z);
@@ -38,7 +38,7 @@ fn pixel(camera: &Camera, point: DVec3) -> [f64; 2] {
 }
 
 #[test]
-fn colmap_sees_points_where_we_do() {
+fn projections_equal_colmaps() {
     let expected: Value =
         serde_json::from_str(&fs::read_to_string(reference().join("expected.json")).unwrap()).unwrap();
     for encoding in ["binary", "text"] {
@@ -69,10 +69,10 @@ fn colmap_sees_points_where_we_do() {
     }
 }
 
-/// For `colmap.py --check`, which says whether COLMAP sees in our files what it saw in its own.
+/// Writes files for `colmap.py --check`, which compares COLMAP's projections through them with those through its own.
 #[test]
 #[ignore = "writes to the folder RAYGRAD_COLMAP"]
-fn writes_what_colmap_reads() {
+fn written_models_for_colmap_check() {
     let Some(folder) = std::env::var_os("RAYGRAD_COLMAP").map(PathBuf::from) else { return };
     let capture = read(&reference().join("binary")).unwrap();
     write(&capture, &folder.join("binary"), Encoding::Binary).unwrap();

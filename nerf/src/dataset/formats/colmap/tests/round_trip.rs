@@ -1,4 +1,4 @@
-//! What is written is read again, and by the model that holds it.
+//! Round trips of written models, and the choice of the camera model.
 
 use super::*;
 use proptest::prelude::*;
@@ -12,7 +12,7 @@ fn capture(views: Vec<View>, points: Vec<Point>) -> Capture {
     Capture { points, ..Capture::new(Path::new("scene"), "transforms.json".into(), Format::Transforms, views) }
 }
 
-/// Lenses, the names of the models that hold them, and how many parameters those have.
+/// Lenses, and the name and number of parameters of the model for each.
 const LENSES: [(Lens, &str, usize); 9] = [
     (Lens::Pinhole, "PINHOLE", 4),
     (Lens::Brown { k: [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] }, "OPENCV", 8),
@@ -25,7 +25,7 @@ const LENSES: [(Lens, &str, usize); 9] = [
     (Lens::Fov { omega: 0.9 }, "FOV", 5),
 ];
 
-/// A rotation by thirds of a turn and quarters of it: products of its entries are exact.
+/// A rotation by thirds and quarters of a turn: products of its entries are exact.
 fn exact_pose(i: usize) -> DAffine3 {
     let quaternions = [
         DQuat::IDENTITY,
@@ -37,14 +37,14 @@ fn exact_pose(i: usize) -> DAffine3 {
     DAffine3 { matrix3: DMat3::from_quat(quaternions[i % 4]), translation }
 }
 
-/// Written and read again.
+/// Writes and reads a capture.
 fn again(capture: &Capture, encoding: Encoding) -> (Capture, tempfile::TempDir) {
     let folder = tempfile::tempdir().unwrap();
     write(capture, folder.path(), encoding).unwrap();
     (read(folder.path()).unwrap(), folder)
 }
 
-/// The same without files.
+/// Writes and reads a capture in memory.
 fn parsed(capture: &Capture, encoding: Encoding) -> Capture {
     let (folder, table) = (Path::new("scene"), Table::new(capture, encoding).unwrap());
     let [cameras, images, points] = match encoding {
@@ -55,7 +55,7 @@ fn parsed(capture: &Capture, encoding: Encoding) -> Capture {
 }
 
 #[test]
-fn everything_comes_back_bit_for_bit() {
+fn colmap_round_trip_is_exact() {
     let views =
         LENSES.iter().enumerate().map(|(i, (lens, _, _))| view(&format!("{i}.png"), *lens, exact_pose(i))).collect();
     let point = |i: u8| Point {
@@ -71,20 +71,20 @@ fn everything_comes_back_bit_for_bit() {
             assert_eq!((&a.name, &a.camera), (&b.name, &b.camera), "{encoding:?}");
         }
         assert_eq!((after.views.len(), &after.points), (before.views.len(), &before.points));
-        // Once more, by the other encoding.
+        // The result round-trips through both encodings again.
         for other in Encoding::ALL {
             let (last, _folder) = again(&after, other);
             let cameras = |capture: &Capture| capture.views.iter().map(|view| view.camera.clone()).collect::<Vec<_>>();
             assert_eq!((cameras(&last), &last.points), (cameras(&after), &after.points));
         }
-        // Over the files of before.
+        // Overwrites the files of the same model.
         write(&before, folder.path(), encoding).unwrap();
         assert_eq!(fs::read_dir(folder.path().join("sparse/0")).unwrap().count(), 3, "nothing else is left");
     }
 }
 
 #[test]
-fn the_smallest_exact_model_is_written() {
+fn writing_uses_the_smallest_exact_model() {
     let views = LENSES.iter().enumerate().map(|(i, (lens, _, _))| view(&format!("{i}.png"), *lens, exact_pose(0)));
     let (_, folder) = again(&capture(views.collect(), vec![]), Encoding::Text);
     let text = fs::read_to_string(folder.path().join("sparse/0/cameras.txt")).unwrap();
@@ -112,7 +112,7 @@ fn equal_colmap_cameras_share_one_entry() {
 }
 
 #[test]
-fn what_cannot_be_written_is_named() {
+fn unwritable_colmap_captures_are_named() {
     let fails = |change: &dyn Fn(&mut Capture), encoding, expected: &str| {
         let mut capture = capture(
             vec![view("a.png", Lens::Pinhole, exact_pose(1)), view("b.png", Lens::Pinhole, exact_pose(2))],
@@ -159,7 +159,7 @@ fn what_cannot_be_written_is_named() {
 }
 
 #[test]
-fn another_model_in_the_folder_is_not_mixed_with_this() {
+fn writing_beside_another_model_is_an_error() {
     let capture = capture(vec![view("a.png", Lens::Pinhole, exact_pose(1))], vec![]);
     let folder = tempfile::tempdir().unwrap();
     write(&capture, folder.path(), Encoding::Binary).unwrap();
@@ -172,7 +172,7 @@ fn another_model_in_the_folder_is_not_mixed_with_this() {
 
 proptest! {
     #[test]
-    fn both_encodings_hold_the_same(
+    fn both_encodings_hold_the_same_numbers(
         numbers in prop::array::uniform32(prop::num::f64::NORMAL | prop::num::f64::SUBNORMAL | prop::num::f64::ZERO),
         q in prop::array::uniform4(-1.0..1.0_f64),
         eye in prop::array::uniform3(-1e3..1e3_f64),
@@ -194,7 +194,7 @@ proptest! {
         let position = DVec3::new(numbers[12], numbers[13], numbers[14]);
         let before = capture(vec![one], vec![Point { position, color, error: numbers[15], views: 0 }]);
         let [a, b] = Encoding::ALL.map(|encoding| parsed(&before, encoding));
-        // As written, which tells the zeros apart.
+        // The debug format tells 0 from -0.
         let said = |capture: &Capture| format!("{:?} {:?}", capture.views[0].camera, capture.points);
         prop_assert_eq!(said(&a), said(&b));
         let camera = &a.views[0].camera;

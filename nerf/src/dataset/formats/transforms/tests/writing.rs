@@ -1,4 +1,4 @@
-//! Tests of what is written: that it comes back, and that other programs find what they look for.
+//! Round trips of written files, and the fields that other programs need.
 
 use super::*;
 use crate::dataset::capture::Point;
@@ -6,7 +6,7 @@ use crate::dataset::formats::kit::{is_whole, picture, says};
 use glam::{DMat3, DVec3};
 use std::f64::consts::PI;
 
-/// A camera whose numbers all have many digits.
+/// A camera with many digits in all numbers.
 fn camera(i: usize) -> Camera {
     let turn = DMat3::from_rotation_y(0.1 + i as f64) * DMat3::from_rotation_x(0.3);
     let pose = DAffine3 { matrix3: turn, translation: DVec3::new(0.1, -1.0 / 3.0, 1e-17 + i as f64) };
@@ -14,7 +14,7 @@ fn camera(i: usize) -> Camera {
     Camera { width: 64, height: 48, focal: [100.1, 99.9 / 3.0], centre: [31.1, 24.7], lens, pose }
 }
 
-/// Three views with everything that the format has place for.
+/// Three views with everything that the format can hold.
 fn capture(folder: &Path) -> Capture {
     let view = |i: usize| {
         let (image, mask) = (folder.join(format!("images/{i}.png")), folder.join(format!("masks/{i}.png")));
@@ -51,7 +51,7 @@ fn capture(folder: &Path) -> Capture {
     }
 }
 
-/// The capture after it was written over itself, and the document.
+/// Writes a capture over itself; returns it read again, and the document.
 #[track_caller]
 fn written(capture: &Capture) -> (Capture, Value) {
     write(capture, &capture.folder).unwrap();
@@ -61,12 +61,12 @@ fn written(capture: &Capture) -> (Capture, Value) {
 }
 
 #[test]
-fn everything_comes_back_bit_for_bit() {
+fn transforms_round_trip_is_exact() {
     let folder = tempfile::tempdir().unwrap();
     let capture = capture(folder.path());
     let (again, document) = written(&capture);
     assert_eq!(again, capture);
-    // What nerfstudio reads.
+    // The fields that nerfstudio reads.
     assert_eq!(document["camera_model"], "OPENCV");
     assert_eq!(document["ply_file_path"], "sparse_pc.ply");
     assert_eq!((&document["w"], &document["fl_x"]), (&64.into(), &100.1.into()));
@@ -84,7 +84,7 @@ fn everything_comes_back_bit_for_bit() {
 }
 
 #[test]
-fn a_capture_moves_to_another_folder() {
+fn written_captures_can_move_to_another_folder() {
     let (from, to) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let capture = capture(from.path());
     write(&capture, to.path()).unwrap();
@@ -101,7 +101,7 @@ fn a_capture_moves_to_another_folder() {
 }
 
 #[test]
-fn cameras_that_differ_stand_in_their_frames() {
+fn different_cameras_are_written_per_frame() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path());
     capture.views[1].camera.focal = [1.0 / 3.0, 2.0 / 3.0];
@@ -110,12 +110,12 @@ fn cameras_that_differ_stand_in_their_frames() {
     let (again, document) = written(&capture);
     assert_eq!(again, capture);
     assert_eq!((document.get("fl_x"), document.get("camera_model")), (None, None));
-    // nerfstudio takes OPENCV where it finds no model.
+    // nerfstudio assumes OPENCV without a model.
     assert_eq!((&document["frames"][2]["camera_model"], &document["frames"][2]["k1"]), (&"OPENCV".into(), &0.0.into()));
 }
 
 #[test]
-fn every_lens_comes_back() {
+fn all_lenses_round_trip() {
     let fisheye = |p, s| Lens::Fisheye { k: [0.1, -0.2 / 3.0, 0.3, -0.4], p, s };
     let full = Lens::Brown { k: [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], p: [0.7, 0.8] };
     for (lens, model) in [
@@ -143,7 +143,7 @@ fn every_lens_comes_back() {
 }
 
 #[test]
-fn little_is_written_of_little() {
+fn absent_fields_are_not_written() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path());
     (capture.points, capture.points_file) = (vec![], None);
@@ -159,7 +159,7 @@ fn little_is_written_of_little() {
 }
 
 #[test]
-fn nerfstudio_finds_a_set_for_validation() {
+fn validation_list_defaults_to_the_test_list() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path());
     capture.views[1].split = Some(Split::Test);
@@ -169,7 +169,7 @@ fn nerfstudio_finds_a_set_for_validation() {
 }
 
 #[test]
-fn names_without_an_ending_get_that_of_the_image() {
+fn names_without_extension_get_the_image_extension() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path());
     capture.views[0].name = "images/0".into();
@@ -179,7 +179,7 @@ fn names_without_an_ending_get_that_of_the_image() {
 }
 
 #[test]
-fn what_cannot_be_written_is_named() {
+fn unwritable_transforms_captures_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let fails = |change: fn(&mut Capture), part: &str| {
         let mut capture = capture(folder.path());
@@ -207,7 +207,7 @@ fn what_cannot_be_written_is_named() {
 }
 
 #[test]
-fn any_numbers_come_back() {
+fn any_camera_numbers_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path());
     capture.views.truncate(1);
