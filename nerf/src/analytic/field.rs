@@ -22,7 +22,7 @@ impl AnalyticField {
     }
 }
 
-/// The positions in the rows of a tensor.
+/// The rows of a tensor as positions.
 fn rows<T: Scalar>(x: &Tensor<T>) -> impl Iterator<Item = [f64; 3]> + '_ {
     x.as_slice().chunks_exact(3).map(|x| [x[0], x[1], x[2]].map(T::to_f64))
 }

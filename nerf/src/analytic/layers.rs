@@ -48,8 +48,8 @@ impl Layers {
             d_depth: vec![0.0; self.0.len()],
             d_transmittance: vec![0.0; self.0.len()],
         };
-        // Back to front: `color` and `depth` are what arrives from behind, and what was differentiated behind a layer is
-        // seen through it.
+        // Back to front: `color` and `depth` arrive from behind, and each layer attenuates them and the derivatives
+        // behind it.
         for (k, layer) in parts.iter().enumerate().rev() {
             let (through, length) = ((-layer.depth()).exp(), layer.to - layer.from);
             for (behind, color, d) in [
@@ -65,18 +65,18 @@ impl Layers {
         exact
     }
 
-    /// The layer that a place belongs to, or the nearest one.
+    /// The layer that contains a position, or the nearest one.
     fn nearest(&self, z: f64) -> &Layer {
         let distance = |layer: &Layer| (layer.from - z).max(z - layer.to);
         self.0.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or(&EMPTY)
     }
 }
 
-/// What there is where there is no layer.
+/// A layer without density.
 const EMPTY: Layer = Layer { from: 0.0, to: 0.0, sigma: 0.0, color: [0.0; 2] };
 
 impl Layer {
-    /// The part in `0..=length`, which may be flat.
+    /// The part in `0..=length`, which may be empty.
     fn clipped(self, length: f64) -> Self {
         Layer { from: self.from.clamp(0.0, length), to: self.to.clamp(0.0, length), ..self }
     }

@@ -44,7 +44,7 @@ impl Exponential {
     }
 }
 
-/// Ei(x) for x > 0 by its series, whose terms are all positive (Abramowitz and Stegun 5.1.10).
+/// Ei(x) for x > 0 by its series of positive terms (Abramowitz and Stegun 5.1.10).
 fn exponential_integral(x: f64) -> f64 {
     const EULER: f64 = 0.577_215_664_901_532_9;
     let (mut sum, mut power, mut n) = (0.0, 1.0, 1.0);
@@ -123,7 +123,7 @@ impl Gaussian {
     }
 }
 
-/// Calls `add` with the places and weights of five-point Gauss-Legendre quadrature on panels of at most this width.
+/// Calls `add` with the nodes and weights of five-point Gauss-Legendre quadrature on panels of at most this width.
 fn integrate([from, to]: [f64; 2], panel: f64, mut add: impl FnMut(f64, f64)) {
     const POINTS: [[f64; 2]; 5] = [
         [-0.906_179_845_938_664, 0.236_926_885_056_189_1],

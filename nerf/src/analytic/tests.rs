@@ -1,4 +1,4 @@
-//! The closed forms against integrals taken numerically in 25 digits, and against what a renderer makes of them.
+//! The closed forms, compared with numerical integrals of 25 digits and with renders.
 
 use super::*;
 use crate::camera::rays::stratified;
@@ -19,7 +19,7 @@ fn reference() -> Vec<(&'static str, Vec<f64>)> {
 }
 
 #[test]
-fn closed_forms_are_what_numerical_integrals_give() {
+fn closed_forms_equal_numerical_integrals() {
     let (scenes, reference) = (scenes(), reference());
     assert_eq!(scenes.len(), reference.len());
     for (scene, (name, expected)) in scenes.iter().zip(reference) {
@@ -31,7 +31,7 @@ fn closed_forms_are_what_numerical_integrals_give() {
         let got: Vec<f64> = values.into_iter().chain((0..amplitudes).flat_map(d)).collect();
         assert_eq!(got.len(), expected.len(), "{name}");
         for (i, (got, expected)) in got.iter().zip(&expected).enumerate() {
-            // One of them is an integral that is taken numerically.
+            // The Gaussian is integrated numerically.
             let tolerance = if name.ends_with("gaussian") { 1e-12 } else { 4e-15 };
             let error = (got - expected).abs() / expected.abs().max(0.25);
             assert!(error <= tolerance, "{name}, {i}: {got:e} {expected:e}");
@@ -40,7 +40,7 @@ fn closed_forms_are_what_numerical_integrals_give() {
 }
 
 #[test]
-fn the_constants_that_were_known_before() {
+fn closed_forms_equal_known_constants() {
     let scenes = scenes();
     let find = |name: &str| scenes.iter().find(|scene| scene.name == name).unwrap();
     let near = |a: f64, b: f64| assert!((a - b).abs() <= 1e-14, "{a} {b}");
@@ -57,11 +57,11 @@ fn the_constants_that_were_known_before() {
 }
 
 #[test]
-fn ball_covers_the_expected_part_of_the_image() {
+fn ball_covers_the_expected_image_share() {
     let ball = Ball { centre: DVec3::ZERO, radius: 0.5, sigma: 3.0, color: 1.0 };
     // pi R^2 - pi (1 - e^(-2 sigma R) (1 + 2 sigma R)) / (2 sigma^2)
     let expected = 0.645_623_168_915_405_2;
-    // By rings, whose chord has half the length h: p dp = -h dh, and everything is smooth in h.
+    // By rings whose half chord is h: p dp = -h dh, and everything is smooth in h.
     let n = 1000;
     let ring = |i: usize| {
         let half_chord = 0.5 * (i as f64 + 0.5) / n as f64;
@@ -77,7 +77,7 @@ fn ball_covers_the_expected_part_of_the_image() {
 }
 
 #[test]
-fn a_layer_beyond_the_ray_is_not_seen() {
+fn layer_beyond_the_ray_is_invisible() {
     let layer = |from, to| Layer { from, to, sigma: 2.0, color: [0.5, 0.0] };
     let cut = Layers::new(&[layer(-2.0, -1.0), layer(1.0, 3.0), layer(5.0, 6.0)]).exact(2.0, 1.0);
     let whole = Layers::new(&[layer(1.0, 2.0)]).exact(2.0, 1.0);
@@ -86,7 +86,7 @@ fn a_layer_beyond_the_ray_is_not_seen() {
 }
 
 #[test]
-fn media_as_fields_are_rendered_and_differentiated() {
+fn analytic_fields_render_with_gradients() {
     for scene in scenes() {
         let mut params = Params::<f64>::new();
         let field = AnalyticField::new(scene.medium.clone(), &mut params);

@@ -18,7 +18,7 @@ pub struct PositionalEncoding {
     pub input: bool,
 }
 
-/// Values that are encoded at a time: a level's sines and cosines then stay in the first-level cache.
+/// Values per block, so that a level's sines and cosines stay in the first-level cache.
 const BLOCK: usize = 192;
 
 impl PositionalEncoding {
@@ -33,7 +33,7 @@ impl PositionalEncoding {
     }
 }
 
-/// `x - 2 round(x / 2)`, exactly: the sinusoids of all levels have the period 2. Without it `2^k x` can be infinite.
+/// `x - 2 round(x / 2)`, exactly: the sinusoids of all levels have the period 2. Without it `2^k x` may overflow.
 #[inline(always)]
 fn reduce<E: Real>(x: E) -> E {
     let turns = (x.like(0.5) * x).round();
@@ -174,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exact_at_every_level_and_magnitude() {
+    fn sinusoids_are_exact_at_all_levels_and_magnitudes() {
         let tape = raygrad_autograd::Tape::<f32>::new();
         for levels in [10, 12, 16] {
             let x = Tensor::from_vec(&[8, 1], vec![0.0, 1.0, -1.0, 0.3, 4.0, -3.999, 1e3 + 0.37, 1e6]);

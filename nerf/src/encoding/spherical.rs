@@ -16,7 +16,7 @@ pub struct SphericalHarmonics {
     degree: usize,
 }
 
-/// Functions of the highest degree.
+/// The number of functions up to the highest degree.
 const MOST: usize = 16;
 
 /// `1 / sqrt(4 pi)`.
@@ -51,7 +51,7 @@ impl SphericalHarmonics {
     }
 }
 
-/// Every function at a direction. For numbers this is the operation, for variables its reference.
+/// Every function at a direction: the operation for numbers, its reference for variables.
 #[inline(always)]
 fn values<E: Real>([x, y, z]: [E; 3]) -> [E; MOST] {
     let times = |factor: f64, e: E| e.like(factor) * e;
@@ -183,8 +183,9 @@ mod tests {
     use std::f64::consts::PI;
 
     #[test]
-    fn orthonormal_on_the_sphere() {
-        // Gauss-Legendre with four nodes in z and eight evenly spaced angles are exact up to degree 7; products have 6.
+    fn spherical_harmonics_are_orthonormal() {
+        // Gauss-Legendre with four nodes in z and eight evenly spaced angles is exact up to degree 7; products have
+        // degree 6.
         let nodes =
             [(0.861_136_311_594_052_6, 0.347_854_845_137_453_85), (0.339_981_043_584_856_3, 0.652_145_154_862_546_1)];
         let mut inner = [[0.0; MOST]; MOST];
@@ -210,7 +211,7 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "the degree of spherical harmonics must be 1 to 4, is 5")]
-    fn a_degree_beyond_the_table_panics() {
+    fn degree_beyond_the_table_panics() {
         SphericalHarmonics::new(5);
     }
 }

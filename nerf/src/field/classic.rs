@@ -12,7 +12,7 @@ use raygrad_nn::{Bound, Init, Linear, Mlp};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Frequencies that are enabled from the start of coarse-to-fine training: they tell halves of the box apart.
+/// Frequencies that coarse-to-fine training enables from the start: they distinguish the halves of the box.
 const FIRST_LEVELS: usize = 2;
 
 /// Configuration of a [`Classic`] field.
@@ -62,7 +62,7 @@ impl ComponentConfig<Fields> for ClassicConfig {
             check_range(name, value, 1, 1 << 14)?;
         }
         check_parameters(self.depth * self.width * (self.width + 200))?;
-        // More frequencies are beyond what f32 can resolve.
+        // f32 cannot resolve more frequencies.
         for (name, value) in [("position_levels", self.position_levels), ("direction_levels", self.direction_levels)] {
             check_range(name, value, 0, 24)?;
         }
@@ -143,7 +143,7 @@ impl<T: Scalar> Field<T> for Classic {
     fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
         let mut encoding = self.sinusoids(&self.space.centred(positions), self.config.position_levels);
         if let Some(weights) = &self.weights {
-            // The bare coordinates come first, then sine and cosine of each for each frequency.
+            // The bare coordinates come first, then per frequency the sine and cosine of each.
             let row = Tensor::from_fn(&[3 + 6 * weights.len()], |i| {
                 T::from_f64(if i < 3 { 1.0 } else { weights[(i - 3) / 6] })
             });
@@ -178,14 +178,14 @@ mod tests {
     use raygrad_nn::Params;
 
     #[test]
-    fn detail_comes_in_from_low_to_high_frequency() {
+    fn detail_enables_low_frequencies_first() {
         let config = ClassicConfig { depth: 1, width: 8, skip_layers: vec![], view_width: 4, ..ClassicConfig::paper() };
         let config = ClassicConfig { position_levels: 6, ..config };
         let mut params = Params::<f64>::new();
         let (space, rng) = (Space::within([DVec3::NEG_ONE, DVec3::ONE]), &mut Pcg64Mcg::seed_from_u64(5));
         let field =
             Classic::new(&config, BuildContext { space, frames: 0, params: &mut params, name: "field", rng }).unwrap();
-        // How much each input of the first layer matters: the bare coordinates, then six numbers a frequency.
+        // The influence of each input of the first layer: the bare coordinates, then six numbers per frequency.
         let inputs = |detail: f64| {
             let tape = Tape::new();
             let bound = params.bind(&tape);
@@ -198,11 +198,12 @@ mod tests {
         };
         let all = inputs(1.0);
         assert!(all.iter().all(|x| *x > 0.0), "{all:?}");
-        // Two of six are always there; with 5/8 of the other four the fifth is half there, and the sixth is not.
+        // Two of six frequencies are always enabled. At 5/8 of the other four, the fifth is half enabled and the sixth
+        // is not.
         for (detail, shares) in [(0.0, [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), (0.625, [1.0, 1.0, 1.0, 1.0, 0.5, 0.0])] {
             let some = inputs(detail);
             let expected = (0..39).map(|i: usize| if i < 3 { 1.0 } else { shares[(i - 3) / 6] } * all[i]);
-            // What activations make of the rest is the same for all inputs of a unit: compare with the bare coordinates.
+            // The shares also change the activations, so only the zeros are compared.
             for (i, expected) in expected.enumerate() {
                 assert_eq!(some[i] == 0.0, expected == 0.0, "{detail}: {i}");
             }

@@ -7,13 +7,13 @@ use crate::encoding::hash_grid::HashGridConfig;
 use raygrad_autograd::{Activation, Scalar, Var};
 use raygrad_nn::{Bound, Init, Linear};
 
-/// A multiresolution hash grid and a network of one hidden layer without biases, whose first output is the logarithm of
-/// the density (Müller et al. 2022, section 5.4).
+/// A multiresolution hash grid and a network of one hidden layer without biases. Its first output is the log density
+/// (Müller et al. 2022, section 5.4).
 #[derive(Debug, Clone)]
 pub(crate) struct DensityNetwork {
     pub grid: Grid,
     layers: [Linear; 2],
-    /// Subtracted from the logarithm of the density.
+    /// Subtracted from the log density.
     shift: f64,
 }
 

@@ -10,7 +10,7 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId};
 use std::sync::Arc;
 
-/// Levels that are enabled from the start of coarse-to-fine training, see [`Grid::with_detail`].
+/// Levels that coarse-to-fine training enables from the start, see [`Grid::with_detail`].
 const FIRST_LEVELS: usize = 3;
 
 /// A hash grid over the scene with its table parameter, shared by fields that look up positions.
@@ -19,7 +19,7 @@ pub struct Grid {
     grid: HashGrid,
     table: ParamId,
     space: Space,
-    /// The weight of each level, if they are not all 1.
+    /// The weight of each level; `None` if all are 1.
     weights: Option<Arc<[f64]>>,
 }
 

@@ -62,7 +62,7 @@ pub struct Instant {
     density: DensityNetwork,
     direction: SphericalHarmonics,
     color: Vec<Linear>,
-    /// The appearance embeddings, if there are any.
+    /// The appearance embeddings, if any.
     codes: Option<ParamId>,
 }
 
@@ -96,7 +96,7 @@ impl Instant {
         let codes = (codes > 0).then(|| {
             let name = format!("{name}.codes");
             let id = params.add(&name, Tensor::zeros(&[frames, codes]));
-            // A step sees few of the images.
+            // Sparse updates, since a step uses few of the images.
             params.set_lazy(|other| other == name, true);
             id
         });

@@ -22,7 +22,7 @@ use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::sync::Arc;
 
-/// Logarithms of densities are cut here: `e^80 delta` is opaque for any interval above 1e-32, and finite.
+/// The largest log density: `e^80 delta` is opaque for any interval above 1e-32, and finite.
 pub(crate) const MOST_LOG_DENSITY: f64 = 80.0;
 
 /// Returns the shift that fields with an exponential density subtract from its logarithm; `unit` is
@@ -126,7 +126,7 @@ mod tests {
     use glam::DVec3;
 
     #[test]
-    fn a_new_field_is_a_thin_fog_in_its_own_unit() {
+    fn new_field_is_a_thin_fog_in_its_unit() {
         for preset in [Preset::Instant, Preset::Voxel] {
             for unit in [1.0, 4.0] {
                 let extent = SceneBox { unit, ..SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]) };

@@ -38,8 +38,8 @@ impl ComponentConfig<Fields> for VoxelConfig {
     }
 }
 
-/// Factor of the log density: without a network it changes by little more than the learning rate per step, and has
-/// further to go than a colour.
+/// Factor of the log density. Without a network a parameter changes by little more than the learning rate per step, and
+/// log densities have a larger range than colours.
 const LOG_DENSITY_GAIN: f64 = 10.0;
 
 /// A voxel grid of densities and spherical harmonics (Fridovich-Keil et al. 2022, "Plenoxels: Radiance Fields without
@@ -53,7 +53,7 @@ const LOG_DENSITY_GAIN: f64 = 10.0;
 pub struct Voxel {
     grid: Grid,
     direction: SphericalHarmonics,
-    /// Subtracted from the logarithm of the density.
+    /// Subtracted from the log density.
     shift: f64,
 }
 

@@ -6,20 +6,20 @@ use glam::{DMat3, DVec3};
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// How many times more a border weighs than a triangle at it.
+/// The weight of a border relative to a triangle.
 const BORDER: f64 = 100.0;
-/// A triangle may turn until the cosine of the angle is this.
+/// The least cosine of the angle between a triangle's normals before and after a collapse.
 const LEAST_COSINE: f64 = 0.2;
-/// Twice the area of a triangle, as a share of the square of its longest side, at least, unless it was as thin before.
+/// The least ratio of twice a triangle's area to its squared longest side, unless the triangle was thinner before.
 const THINNEST: f64 = 0.02;
-/// Below this share of its largest possible value, a determinant is that of a quadric without a lowest point.
+/// A quadric has no unique minimum if its determinant is below this share of the largest possible value.
 const FLAT: f64 = 1e-6;
-/// Of a triangle's own weight, that for staying where a vertex is: in a plane it decides.
+/// The weight of a vertex's old position relative to its triangles'. In a plane it determines the minimum.
 const STAY: f64 = 1e-6;
 /// Triangles between two reports of progress.
 const OFTEN: usize = 10_000;
 
-/// The sum of squared distances to some planes, each times a weight: `x' a x - 2 b' x + c`.
+/// A weighted sum of squared distances to planes: `x' a x - 2 b' x + c`.
 #[derive(Debug, Clone, Copy)]
 struct Quadric {
     a: DMat3,
@@ -28,10 +28,10 @@ struct Quadric {
 }
 
 impl Quadric {
-    /// To no planes.
+    /// No planes.
     const NONE: Quadric = Quadric { a: DMat3::ZERO, b: DVec3::ZERO, c: 0.0 };
 
-    /// To the plane through a point with this unit normal.
+    /// The plane through a point with this unit normal.
     fn plane(normal: DVec3, point: DVec3, weight: f64) -> Self {
         let offset = normal.dot(point);
         let scaled = weight * normal;
@@ -42,7 +42,7 @@ impl Quadric {
         }
     }
 
-    /// To a point.
+    /// A point.
     fn point(point: DVec3, weight: f64) -> Self {
         Quadric { a: weight * DMat3::IDENTITY, b: weight * point, c: weight * point.length_squared() }
     }
@@ -55,24 +55,24 @@ impl Quadric {
         (x.dot(self.a * x - 2.0 * self.b) + self.c).max(0.0)
     }
 
-    /// Where it is least, if that is one place.
+    /// The minimum, if it is unique.
     fn lowest(&self) -> Option<DVec3> {
         let size = (self.a.x_axis.x + self.a.y_axis.y + self.a.z_axis.z) / 3.0;
         (self.a.determinant() > FLAT * size.powi(3)).then(|| self.a.inverse() * self.b)
     }
 }
 
-/// An edge that may be drawn together: the bits of its cost, which is at least 0, so that they are in the same order;
-/// its vertices, and how often each had been moved when this was worked out. The one that costs least is the greatest.
+/// A candidate for an edge collapse: the bits of its cost, its vertices, and the number of moves of each when the cost
+/// was computed. The bits have the order of the costs, since costs are at least 0. The cheapest is the greatest.
 type Candidate = Reverse<(u64, [u32; 2], [u32; 2])>;
 
-/// A mesh of which edges are drawn together.
+/// A mesh during decimation.
 struct Work<'a> {
     mesh: &'a mut Mesh,
     quadrics: Vec<Quadric>,
     /// The triangles at each vertex.
     around: Vec<Vec<u32>>,
-    /// How often each vertex has been moved.
+    /// The number of moves of each vertex.
     moved: Vec<u32>,
     heap: BinaryHeap<Candidate>,
 }
@@ -104,7 +104,7 @@ impl Mesh {
     }
 }
 
-/// What a triangle is that is no more.
+/// A removed triangle.
 const GONE: [u32; 3] = [u32::MAX; 3];
 
 impl<'a> Work<'a> {
@@ -133,7 +133,7 @@ impl<'a> Work<'a> {
         }
         for i in 0..work.mesh.triangles.len() {
             for [from, to] in sides(&work.mesh.triangles[i]) {
-                // Once for each edge, and those of borders, which are passed one way only.
+                // Each inner edge occurs once in rising order. A border edge occurs once in either order.
                 if from < to || work.common(from, to).count() == 1 {
                     work.consider(from, to);
                 }
@@ -142,7 +142,7 @@ impl<'a> Work<'a> {
         work
     }
 
-    /// Adds what holds a side of a triangle at the border in its place: a plane through it, upright on the triangle.
+    /// Adds a plane through a border edge, perpendicular to its triangle, which keeps the edge in place.
     fn keep_border(&mut self, triangle: usize, side: [u32; 2]) {
         let [a, b, c] = self.mesh.corners(triangle);
         let [from, to] = side.map(|vertex| self.mesh.positions[vertex as usize]);
@@ -154,13 +154,13 @@ impl<'a> Work<'a> {
         }
     }
 
-    /// The triangles that have both vertices.
+    /// The triangles that contain both vertices.
     fn common(&self, a: u32, b: u32) -> impl Iterator<Item = usize> + '_ {
         let around = self.around[a as usize].iter().map(|&triangle| triangle as usize);
         around.filter(move |&triangle| self.mesh.triangles[triangle].contains(&b))
     }
 
-    /// The vertices that share a triangle with this one, in rising order.
+    /// The neighbours of a vertex, in rising order.
     fn neighbours(&self, vertex: u32) -> Vec<u32> {
         let triangles = self.around[vertex as usize].iter().flat_map(|&i| self.mesh.triangles[i as usize]);
         let mut neighbours: Vec<u32> = triangles.filter(|&other| other != vertex).collect();
@@ -169,27 +169,27 @@ impl<'a> Work<'a> {
         neighbours
     }
 
-    /// What it costs to draw an edge together, and where both vertices go.
+    /// The cost of an edge collapse, and the new position of both vertices.
     fn cheapest(&self, edge: [u32; 2]) -> (f64, DVec3) {
         let quadric = self.quadrics[edge[0] as usize].plus(&self.quadrics[edge[1] as usize]);
         let [from, to] = edge.map(|vertex| self.mesh.positions[vertex as usize]);
         let middle = 0.5 * (from + to);
-        // A place far away would be one of a quadric that is nearly flat.
+        // The minimum of a nearly flat quadric may be far away.
         let lowest = quadric.lowest().filter(|place| place.distance(middle) < 2.0 * from.distance(to));
         let places = [lowest.unwrap_or(middle), from, to];
         let place = places.into_iter().min_by(|a, b| quadric.at(*a).total_cmp(&quadric.at(*b))).unwrap_or(middle);
         (quadric.at(place), place)
     }
 
-    /// Works out what it costs to draw an edge together.
+    /// Adds an edge to the candidates.
     fn consider(&mut self, a: u32, b: u32) {
         let edge = [a.min(b), a.max(b)];
         let moved = edge.map(|vertex| self.moved[vertex as usize]);
         self.heap.push(Reverse((self.cheapest(edge).0.to_bits(), edge, moved)));
     }
 
-    /// Draws an edge together, if its vertices have been moved no more often than `moved` says and nothing speaks
-    /// against it. Says how many triangles that takes away.
+    /// Collapses an edge if its vertices have not moved since `moved` and the checks pass. Returns the number of
+    /// removed triangles.
     fn collapse(&mut self, edge: [u32; 2], moved: [u32; 2]) -> usize {
         if edge.map(|vertex| self.moved[vertex as usize]) != moved {
             return 0;
@@ -219,7 +219,7 @@ impl<'a> Work<'a> {
         gone.len()
     }
 
-    /// Whether the surface stays one without its edge, and no triangle turns over or becomes a needle.
+    /// Returns true if a collapse keeps the surface a manifold, and no triangle flips or becomes a needle.
     fn may_collapse(&self, [a, b]: [u32; 2], place: DVec3) -> bool {
         let gone: Vec<usize> = self.common(a, b).collect();
         let (around_a, around_b) = (self.neighbours(a), self.neighbours(b));
@@ -229,11 +229,11 @@ impl<'a> Work<'a> {
             return false;
         }
         let is_border = |vertex: u32, neighbours: &[u32]| neighbours.len() != self.around[vertex as usize].len();
-        // From border to border across the surface there would be a vertex with two borders.
+        // An inner edge between two border vertices would become a vertex with two borders.
         if gone.len() == 2 && is_border(a, &around_a) && is_border(b, &around_b) {
             return false;
         }
-        // A vertex of three triangles would be left with two that cover each other; one of a single one, with none.
+        // A vertex of three triangles would keep two that coincide; a border vertex of one triangle would keep none.
         let opposite = gone.iter().flat_map(|&i| self.mesh.triangles[i]).filter(|vertex| *vertex != a && *vertex != b);
         for vertex in opposite {
             let triangles = self.around[vertex as usize].len();
@@ -257,7 +257,7 @@ impl<'a> Work<'a> {
     }
 }
 
-/// The triangles at `vertex` that do not have `other`, and which of their corners `vertex` is.
+/// The triangles at `vertex` without `other`, and the corner that `vertex` is in each.
 fn edge_triangles<'a>(work: &'a Work<'_>, vertex: u32, other: u32) -> impl Iterator<Item = ([DVec3; 3], usize)> + 'a {
     work.around[vertex as usize].iter().filter_map(move |&i| {
         let triangle = work.mesh.triangles[i as usize];

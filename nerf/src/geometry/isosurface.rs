@@ -7,13 +7,14 @@ use crate::{Error, Result};
 use glam::DVec3;
 use raygrad_tensor::parallel;
 
-/// Times that the part of an edge in which the surface lies is halved.
+/// Bisections of each edge that the surface crosses.
 const HALVINGS: usize = 5;
-/// Vertices stay this share of that part away from its ends, so that no two are in one place.
+/// The least distance of vertices from the ends of the last interval, as a share of it, so that vertices never
+/// coincide.
 const MARGIN: f64 = 0.01;
-/// Cells along an axis, at most.
+/// The most cells along an axis.
 pub(super) const MOST_CELLS: usize = 4096;
-/// Vertices, at most: with what belongs to them, some gigabytes.
+/// The most vertices; with the data of each they take some gigabytes.
 const MOST_VERTICES: usize = 1 << 26;
 
 /// A lattice of evenly spaced nodes, on which [`isosurface`] evaluates a function.
@@ -21,7 +22,7 @@ const MOST_VERTICES: usize = 1 << 26;
 pub struct Lattice {
     /// The first node.
     low: DVec3,
-    /// The distances between nodes.
+    /// The distance between nodes along each axis.
     cell: DVec3,
     /// The number of nodes along each axis.
     nodes: [usize; 3],
@@ -65,17 +66,18 @@ impl Lattice {
 
 /// An edge of the lattice that the surface crosses.
 struct Crossing {
-    /// Its lower node, and its axis.
+    /// The lower node and the axis.
     node: [u32; 3],
     axis: u8,
-    /// The values at its lower and its upper end.
+    /// The values at the lower and the upper end.
     values: [f32; 2],
 }
 
-/// The nodes of one layer, and the vertices on the edges that begin there.
+/// The nodes of one layer, and the vertices on the edges that start there.
 struct Layer {
     values: Vec<f32>,
-    /// By axis and node; those along z lead to the next layer. Where there is none the number means nothing.
+    /// Vertex numbers by axis and node. Edges along z lead to the next layer. The number is meaningless without a
+    /// crossing.
     vertices: [Vec<u32>; 3],
 }
 
@@ -97,7 +99,7 @@ pub fn isosurface(
     limited(lattice, level, density, progress, MOST_VERTICES)
 }
 
-/// The same, of at most so many vertices.
+/// [`isosurface`] with at most `most` vertices.
 fn limited(
     lattice: &Lattice,
     level: f32,
@@ -140,7 +142,7 @@ fn limited(
         if let Some(below) = &below {
             let between = [below, &above];
             for (x, y) in (0..height - 1).flat_map(|y| (0..width - 1).map(move |x| (x, y))) {
-                // Where a corner, or an edge that begins there, is in its layer.
+                // The index in its layer of a corner, or of an edge that starts there.
                 let place = |corner: usize| x + (corner & 1) + width * (y + (corner >> 1 & 1));
                 let bit = |corner: usize| usize::from(is_dense(between[corner >> 2].values[place(corner)])) << corner;
                 let dense: usize = (0..8).map(bit).sum();
@@ -168,12 +170,12 @@ fn layer(lattice: &Lattice, z: usize, density: &DensityFn<'_>) -> Vec<f32> {
     values
 }
 
-/// Where the level is passed on each of these edges.
+/// The positions at which these edges cross the level.
 fn places(lattice: &Lattice, level: f32, density: &DensityFn<'_>, crossings: &[Crossing]) -> Vec<DVec3> {
     let mut places = vec![DVec3::ZERO; crossings.len()];
     let parts = places.chunks_mut(POINTS).zip(crossings.chunks(POINTS));
     parallel::each_of(parts, |_, (places, crossings)| {
-        // For each edge the part, as shares of it, in which the level is passed, and the values at the ends of that.
+        // For each edge, the interval with the crossing, as shares of the edge, and the values at its ends.
         let mut parts: Vec<[(f64, f32); 2]> =
             crossings.iter().map(|c| [(0.0, c.values[0]), (1.0, c.values[1])]).collect();
         let at = |crossing: &Crossing, share: f64| {
@@ -193,7 +195,7 @@ fn places(lattice: &Lattice, level: f32, density: &DensityFn<'_>, crossings: &[C
             }
         }
         for ((place, crossing), [from, to]) in places.iter_mut().zip(crossings).zip(&parts) {
-            // The values are nearly on a line by now. Of infinite ones there is no telling.
+            // Values are nearly linear by now. Infinite values give no ratio.
             let share = f64::from((level - from.1) / (to.1 - from.1));
             let known = from.1.is_finite() && to.1.is_finite() && !share.is_nan();
             let share = if known { share.clamp(MARGIN, 1.0 - MARGIN) } else { 0.5 };

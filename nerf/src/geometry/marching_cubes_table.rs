@@ -6,8 +6,7 @@
 
 use std::collections::BTreeMap;
 
-/// An edge of a cell, by its axis and its lower corner. Bit `a` of a corner says whether it is the upper one along axis
-/// `a`.
+/// An edge of a cell, by its axis and its lower corner. Bit `a` of a corner is 1 at the upper end of axis `a`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Edge {
     pub axis: usize,
@@ -15,25 +14,25 @@ pub(super) struct Edge {
 }
 
 impl Edge {
-    /// Between two neighbouring corners.
+    /// The edge between two neighbouring corners.
     fn between(a: usize, b: usize) -> Self {
         Edge { axis: (a ^ b).trailing_zeros() as usize, corner: a & b }
     }
 
-    /// Whether there is a face that both are edges of.
+    /// Returns true if both edges belong to one face.
     fn shares_face(self, other: Edge) -> bool {
         let same_side = |axis: &usize| (self.corner ^ other.corner) >> axis & 1 == 0;
         (0..3).filter(|axis| *axis != self.axis && *axis != other.axis).any(|axis| same_side(&axis))
     }
 }
 
-/// For each set of dense corners (bit `c` for corner `c`) the triangles, whose vertices lie on these edges,
-/// anticlockwise as seen from where it is not dense.
+/// For each set of dense corners (bit `c` for corner `c`), the triangles by the edges of their vertices. They are
+/// anticlockwise from the side that is not dense.
 pub(super) fn cases() -> Vec<Vec<[Edge; 3]>> {
     (0..=255).map(|dense| loops(dense).iter().flat_map(|outline| fan(outline)).collect()).collect()
 }
 
-/// The corners of each face, anticlockwise as seen from outside of the cell.
+/// The corners of each face, anticlockwise from outside of the cell.
 fn faces() -> [[usize; 4]; 6] {
     std::array::from_fn(|face| {
         let (axis, side) = (face / 2, face % 2);
@@ -43,7 +42,7 @@ fn faces() -> [[usize; 4]; 6] {
     })
 }
 
-/// The outlines of the surface, each a loop of edges.
+/// The outlines of the surface as loops of edges.
 fn loops(dense: u8) -> Vec<Vec<Edge>> {
     let is_dense = |corner: usize| dense >> corner & 1 == 1;
     let mut next = BTreeMap::new();
@@ -51,8 +50,8 @@ fn loops(dense: u8) -> Vec<Vec<Edge>> {
         for i in 0..4 {
             let corner = |k: usize| face[(i + k) % 4];
             if !is_dense(corner(0)) && is_dense(corner(1)) {
-                // From where a run of dense corners begins to where it ends. On the next face, which is walked the other
-                // way along their common edge, the one that ends here begins.
+                // From the start of a run of dense corners to its end. The adjacent face runs along the common edge in
+                // the other direction, so its run starts at this one's end.
                 let run = (1..4).take_while(|&k| is_dense(corner(k))).count();
                 next.insert(Edge::between(corner(0), corner(1)), Edge::between(corner(run), corner(run + 1)));
             }
@@ -70,8 +69,8 @@ fn loops(dense: u8) -> Vec<Vec<Edge>> {
     loops
 }
 
-/// Triangles that fill a loop, all from one vertex: one from which no side of a triangle lies in a face of the cell,
-/// where the neighbour may have the same one. There always is such a vertex.
+/// Fills a loop with triangles that share one vertex. No edge of the fan lies in a face of the cell, where the
+/// neighbour may have the same edge. Such a vertex always exists.
 fn fan(outline: &[Edge]) -> impl Iterator<Item = [Edge; 3]> + '_ {
     let count = outline.len();
     let apex = (0..count).find(|&apex| is_inside(outline, apex)).unwrap_or(0);
@@ -79,7 +78,7 @@ fn fan(outline: &[Edge]) -> impl Iterator<Item = [Edge; 3]> + '_ {
     (1..count - 1).map(move |k| [at(0), at(k), at(k + 1)])
 }
 
-/// Whether the sides of a fan from this vertex pass through the inside of the cell.
+/// Returns true if the edges of a fan from this vertex pass through the inside of the cell.
 fn is_inside(outline: &[Edge], apex: usize) -> bool {
     let count = outline.len();
     (2..count - 1).all(|k| !outline[apex].shares_face(outline[(apex + k) % count]))
@@ -90,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn edges_share_a_face_where_their_middles_do() {
+    fn shares_face_equals_geometry() {
         let middle = |edge: Edge| [0, 1, 2].map(|axis| (axis != edge.axis).then_some(edge.corner >> axis & 1));
         let edges = (0..3).flat_map(|axis| (0..8).map(move |corner| Edge { axis, corner }));
         let edges: Vec<Edge> = edges.filter(|edge| edge.corner >> edge.axis & 1 == 0).collect();
@@ -101,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn every_loop_has_a_fan_that_stays_inside() {
+    fn loops_have_a_fan_inside_the_cell() {
         let mut longest = 0;
         for dense in 0..=255 {
             for outline in loops(dense) {
@@ -128,7 +127,8 @@ mod tests {
             let edges = (0..3).flat_map(|axis| (0..8).map(move |corner| Edge { axis, corner }));
             let expected = edges.filter(|edge| edge.corner >> edge.axis & 1 == 0).filter(crossed).count();
             assert_eq!(all.len(), expected, "{dense:#b}: each crossed edge has a vertex");
-            // One dense corner is cut off by a triangle that faces away from it, one that is not by one that faces it.
+            // A single dense corner gives a triangle that faces away from it; a single corner that is not dense gives
+            // one that faces it.
             if [1, 7].contains(&dense.count_ones()) {
                 let alone = if dense.count_ones() == 1 { dense } else { 255 - dense }.trailing_zeros() as usize;
                 let corner = glam::DVec3::new((alone & 1) as f64, (alone >> 1 & 1) as f64, (alone >> 2) as f64);
@@ -137,10 +137,10 @@ mod tests {
                 assert_eq!((triangles.len(), faces_away), (1, dense.count_ones() == 1), "{dense:#b}");
             }
         }
-        // Two dense corners across a face from each other are parted; four in a face are one square.
+        // Two dense corners diagonal on a face are separate; four on a face give one square.
         assert_eq!(loops(0b0000_1001).len(), 2);
         assert_eq!(loops(0b0000_1111).iter().map(Vec::len).collect::<Vec<_>>(), [4]);
-        // Where all but two across a face are dense, the surface joins round these, as the dense ones are parted.
+        // With two diagonal corners of a face not dense, one loop surrounds both, as dense corners separate.
         assert_eq!(loops(0b1111_0110).iter().map(Vec::len).collect::<Vec<_>>(), [6]);
     }
 }

@@ -34,7 +34,7 @@ impl Mesh {
     /// Returns the volume within a closed mesh, in cubic units, by the divergence theorem. It is negative if triangles
     /// face inwards.
     pub fn volume(&self) -> f64 {
-        // Seen from a vertex, as far from the origin products lose what they differ in.
+        // Relative to a vertex: far from the origin, products lose their differing digits.
         let from = self.positions.first().copied().unwrap_or_default();
         (0..self.triangles.len()).map(|i| volume(self.corners(i).map(|corner| corner - from))).sum()
     }
@@ -107,13 +107,13 @@ impl Mesh {
     }
 }
 
-/// The smallest box around places, lower and upper corner; `None` without any.
+/// The lower and upper corner of the smallest box around points; `None` without any.
 pub(super) fn bounds(places: &[DVec3]) -> Option<[DVec3; 2]> {
     let first = *places.first()?;
     Some(places.iter().fold([first; 2], |[low, high], &x| [low.min(x), high.max(x)]))
 }
 
-/// The sides of a triangle as it passes them.
+/// The directed edges of a triangle.
 pub(super) fn sides(&[a, b, c]: &[u32; 3]) -> [[u32; 2]; 3] {
     [[a, b], [b, c], [c, a]]
 }
@@ -126,7 +126,7 @@ fn volume([a, b, c]: [DVec3; 3]) -> f64 {
     a.dot(b.cross(c)) / 6.0
 }
 
-/// The first of those that are joined with a vertex; the way there is halved.
+/// The representative of a vertex's component (union-find with path halving).
 fn find(leader: &mut [u32], mut vertex: u32) -> u32 {
     while leader[vertex as usize] != vertex {
         leader[vertex as usize] = leader[leader[vertex as usize] as usize];
@@ -144,7 +144,8 @@ pub(super) mod tests {
         let far = tetrahedron(DVec3::new(320_000.3, 5_800_000.7, 43.1), 2.0);
         assert!((far.volume() / (8.0 / 6.0) - 1.0).abs() < 1e-6, "{}", far.volume());
         let corner = tetrahedron(DVec3::ONE, 3.0);
-        // At the corner of the right angles, the mean of three equal sides; at another, of two and of the slanted one.
+        // At the corner of the right angles, the normal is the mean of three equal sides; elsewhere of two and the
+        // slanted one.
         let normals = corner.normals();
         let at = |place: DVec3| normals[corner.positions.iter().position(|x| *x == place).unwrap()];
         assert!(at(DVec3::ONE).distance(-DVec3::ONE.normalize()) < 1e-12);
@@ -168,11 +169,11 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn measures_of_a_tetrahedron() {
+    fn tetrahedron_has_known_volume_and_area() {
         let at = DVec3::new(1.0, -2.0, 3.0);
         let mesh = tetrahedron(at, 2.0);
         assert!((mesh.volume() - 8.0 / 6.0).abs() < 1e-12);
-        // Three right triangles, and one with sides of length 2 sqrt 2.
+        // Three right triangles, and one with edges of length 2 sqrt 2.
         assert!((mesh.area() - (3.0 * 2.0 + 2.0 * 3.0_f64.sqrt())).abs() < 1e-12);
         assert_eq!(mesh.bounds(), Some([at, at + 2.0]));
         assert_eq!(Mesh::default().bounds(), None);
@@ -181,7 +182,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn what_is_closed() {
+    fn is_closed_needs_two_triangles_per_edge() {
         let mesh = tetrahedron(DVec3::ZERO, 1.0);
         let with = |change: &dyn Fn(&mut Vec<[u32; 3]>)| {
             let mut mesh = mesh.clone();
@@ -198,13 +199,13 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn small_parts_go() {
+    fn small_components_are_dropped() {
         let sizes = [1.0, 0.5, 3.0, 0.2];
         let all = sizes.iter().enumerate().map(|(i, &size)| tetrahedron(DVec3::splat(5.0 * i as f64), size));
         let all = all.reduce(|a, b| both(a, &b)).unwrap();
         let (parts, count) = all.components();
         assert_eq!((&parts[..], count), (&[0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3][..], 4));
-        // Areas are as squares of sizes: 1/9, 1/36, 1 and 1/225 of the largest.
+        // Areas scale with squared sizes: 1/9, 1/36, 1 and 1/225 of the largest.
         for (share, left) in [(0.0, 4), (0.004, 4), (0.01, 3), (0.05, 2), (0.2, 1), (1.0, 1)] {
             let mut mesh = all.clone();
             assert_eq!(mesh.drop_small_components(share), 4 - left, "{share}");

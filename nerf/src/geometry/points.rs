@@ -12,10 +12,9 @@ use crate::{Error, Result};
 use glam::DVec3;
 use std::collections::HashMap;
 
-/// Rays for each point that is wanted: some see nothing solid, and the places of several are one point.
+/// Rays per requested point: some rays hit nothing, and several hits may become one point.
 const RAYS: f64 = 12.0;
-/// Times that the span of the logarithms of the voxels' possible edges, about 14, is halved: then the edge is known to
-/// a thousandth.
+/// Bisections of the logarithm of the voxel size. Its range is about 14, so they give the size to a thousandth.
 const HALVINGS: usize = 14;
 
 /// An extracted point cloud.
@@ -44,7 +43,7 @@ impl Model<f32> {
         count: usize,
         progress: &mut dyn FnMut(Stage, f64),
     ) -> Result<PointCloud> {
-        // As many for each camera, however large its photograph is.
+        // Each camera gets the same number of rays, for any image size.
         let rays = RAYS * count as f64 / cameras.len().max(1) as f64;
         let scale = |camera: &Camera| (rays / (camera.width * camera.height) as f64).sqrt();
         let views = views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done));
@@ -69,15 +68,15 @@ impl Model<f32> {
     }
 }
 
-/// At most `count` of these places, the one nearest to its middle in each voxel that has any, in voxels that are as
-/// small as that allows.
+/// Thins points to at most `count`: the one nearest to the centre of each occupied voxel, in the smallest voxels that
+/// allow it.
 fn thinned(places: &[DVec3], count: usize) -> Vec<DVec3> {
     let bounds = bounds(places).unwrap_or_default();
     let size = (bounds[1] - bounds[0]).max_element();
     if places.len() <= count || size == 0.0 {
         return places[..count.min(places.len())].to_vec();
     }
-    // Of more than `count` voxels no more is of interest.
+    // The search only asks if there are more than `count` voxels, so counting stops there.
     let in_voxels = |edge: f64| {
         let mut nearest: HashMap<[i64; 3], usize> = HashMap::new();
         for (i, &place) in places.iter().enumerate() {
@@ -93,7 +92,7 @@ fn thinned(places: &[DVec3], count: usize) -> Vec<DVec3> {
         }
         nearest
     };
-    // One voxel that is larger than all is enough for any count, and for none are voxels needed that are smaller than this.
+    // One voxel larger than all points is enough for any count. Smaller voxels than the lower bound are never needed.
     let [mut small, mut large] = [(1e-6 * size).ln(), (1.001 * size).ln()];
     for _ in 0..HALVINGS {
         let middle = 0.5 * (small + large);
@@ -110,7 +109,7 @@ mod tests {
 
     #[test]
     fn points_are_thinned_to_even_distances() {
-        // On a plane, four times as many on its left half.
+        // Points on a plane, four times as dense on its left half.
         let place = |i: usize| {
             let (u, v) = ((i as f64 * 0.754877666).fract(), (i as f64 * 0.569840291).fract());
             DVec3::new(if i.is_multiple_of(5) { 1.0 + u } else { u }, 2.0 * v, 0.3)
@@ -121,7 +120,8 @@ mod tests {
         let left = kept.iter().filter(|place| place.x < 1.0).count();
         assert!((0.45..0.55).contains(&(left as f64 / kept.len() as f64)), "{left} of {}", kept.len());
         assert!(kept.iter().all(|place| places.contains(place)), "they are some of those that were seen");
-        // In squares of an edge of about sqrt(4 / 900), near the middles: few are nearer to each other than half of that.
+        // The voxels have edges of about sqrt(4 / 900), and points are near their centres: few are closer than half an
+        // edge.
         let near = |a: &DVec3| kept.iter().any(|b| b != a && a.distance(*b) < 0.5 * (4.0_f64 / 900.0).sqrt());
         let crowded = kept.iter().filter(|place| near(place)).count();
         assert!(crowded * 20 < kept.len(), "{crowded}");

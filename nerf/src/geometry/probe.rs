@@ -13,7 +13,7 @@ use raygrad_autograd::{Pool, Segments, Tape, Tensor};
 use raygrad_tensor::parallel;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A model that is asked at places, and how often it was.
+/// Evaluates a model at points and counts the evaluations.
 pub(super) struct Probe<'a> {
     model: &'a Model<f32>,
     pool: Pool<f32>,

@@ -26,7 +26,7 @@ pub(super) struct Sight {
     pub sigma: f64,
 }
 
-/// What the pixels of a camera see.
+/// The hit points of a camera's pixels.
 pub(super) struct Seen {
     /// Row by row; `None` for those that see nothing solid.
     pub sights: Vec<Option<Sight>>,
@@ -34,8 +34,8 @@ pub(super) struct Seen {
     pub evaluations: Evaluations,
 }
 
-/// What cameras see in pictures of `scale` times their size, and these cameras. `progress` is told what share of them
-/// is done.
+/// Renders the hit points of cameras resized by `scale`; also returns the resized cameras. `progress` receives the
+/// finished share.
 pub(super) fn views(
     model: &Model<f32>,
     cameras: &[Camera],
@@ -52,7 +52,7 @@ pub(super) fn views(
     cameras.iter().enumerate().map(view).collect()
 }
 
-/// What a camera's pixels see. Distances are exact to a share of the sampler's steps for views.
+/// The hit points of a camera's pixels. Distances are exact up to a share of a render's step.
 fn sights(model: &Model<f32>, camera: &Camera) -> Seen {
     let mut sights = vec![None; camera.width * camera.height];
     let see = |pool: &Pool<f32>, _, rays: &Rays<f32>, out: &mut [Option<Sight>]| see(model, rays, pool, out);
@@ -72,7 +72,7 @@ fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>, out: &mut [Option
                     let [t, delta, x] = [samples.t.as_slice(), samples.delta.as_slice(), x].map(|x| f64::from(x[row]));
                     let before = round.in_front[row];
                     if halves[*ray].is_none() && before + x >= LN_2 {
-                        // Within a step the density is one.
+                        // The density is constant within a step.
                         halves[*ray] = Some([t - 0.5 * delta + delta * (LN_2 - before) / x, x / delta]);
                     }
                 }

@@ -16,11 +16,11 @@ use glam::DVec3;
 use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Cells of a lattice along each cell of an occupancy grid, by default.
+/// The default number of lattice cells along each cell of an occupancy grid.
 const FINER: usize = 2;
-/// Where a sampler has no grid, one is made of cells that hold at least this share of the level.
+/// Samplers without a grid get one, of cells with at least this share of the iso-value.
 const FAINT: f64 = 0.1;
-/// Pixels along the longer side of the pictures that say what is seen, at most.
+/// The most pixels along the longer side of the images that find visible surfaces.
 const PIXELS: f64 = 128.0;
 
 /// Configuration of [`Model::surface`].
@@ -133,7 +133,7 @@ impl Model<f32> {
         let hidden = config.fill_unseen.then(|| Hidden::new(&views, judged));
         let resolution = config.resolution.unwrap_or(FINER * grid.resolution());
         let lattice = Lattice::over(if config.closed { bounds } else { within(bounds) }, resolution, config.closed)?;
-        // What is hidden is dense whatever the level.
+        // Unseen points have infinite density, above any iso-value.
         let is_met = AtomicBool::new(false);
         let shown = |points: &[[f32; 3]], out: &mut [f32]| {
             if probe.shown(Some(&grid), hidden.as_ref(), points, out) > level as f32 {
@@ -171,8 +171,8 @@ impl Model<f32> {
         self.scene_box.space().side() / cells as f64
     }
 
-    /// The lower quartile of the density of the places within the box that cameras see. Where the density is less the
-    /// surface has holes, and where it is more it lies but a little too far out.
+    /// The lower quartile of the densities at the visible points in the box. A higher iso-value would make holes in the
+    /// surface. A lower one moves it outwards only a little.
     fn level(&self, views: &[(Camera, Seen)]) -> Result<f64> {
         let sights = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten());
         let mut sigmas: Vec<f64> =
@@ -185,7 +185,7 @@ impl Model<f32> {
     }
 }
 
-/// The largest box within this one with f32 corners, so that points on its faces stay in the box.
+/// The largest box with f32 corners inside this one, so that points on its faces stay in the box.
 fn within([low, high]: [DVec3; 2]) -> [DVec3; 2] {
     let above = |x: f64| {
         let near = x as f32;

@@ -7,7 +7,7 @@ use glam::DVec3;
 /// The visible distance of each camera's pixels.
 pub(super) struct Hidden {
     views: Vec<(Camera, Vec<f64>)>,
-    /// Distance behind the visible surface up to which points are not hidden, in scene units.
+    /// Points up to this distance behind the visible surface are not hidden, in scene units.
     margin: f64,
 }
 
@@ -43,7 +43,7 @@ mod tests {
     use super::*;
     use crate::volume::render::Evaluations;
 
-    /// Cameras of 4 x 2 pixels that see something at a distance of 2, but in the pixel at the upper right.
+    /// A camera of 4 x 2 pixels with hits at a distance of 2, except in the upper right pixel.
     fn from(eye: DVec3, target: DVec3) -> (Camera, Seen) {
         let camera = Camera::from_angle(4, 2, 1.0, Camera::look_at(eye, target, DVec3::Z));
         let sight = Sight { place: DVec3::ZERO, distance: 2.0, sigma: 1.0 };
@@ -53,7 +53,7 @@ mod tests {
 
     #[test]
     fn points_hidden_in_all_views_are_unseen() {
-        // Along +y, with +x to the right.
+        // The camera looks along +y, with +x to the right.
         let first = || from(DVec3::ZERO, DVec3::Y);
         let alone = Hidden::new(&[first()], 0.5);
         for (place, hidden) in [
@@ -61,9 +61,9 @@ mod tests {
             ([0.1, 2.6, -0.1], true),
             ([-1.0, 2.6, 0.4], true),
             ([1.0, 2.6, -0.4], true),
-            // The pixel that sees nothing.
+            // The pixel without a hit.
             ([1.0, 2.6, 0.4], false),
-            // Beside the picture, and behind the camera.
+            // Outside of the image, and behind the camera.
             ([3.0, 2.6, 0.0], false),
             ([-3.0, 2.6, 0.0], false),
             ([0.1, 2.6, -1.5], false),
@@ -73,7 +73,7 @@ mod tests {
             assert_eq!(alone.holds(DVec3::from(place)), hidden, "{place:?}");
         }
         let place = DVec3::new(0.1, 2.6, -0.1);
-        // From the side it is as far as 1 from the eye.
+        // A second camera sees the point at a distance of 1.
         let near = from(place - DVec3::X, place);
         assert!(!Hidden::new(&[first(), near], 0.5).holds(place));
         let far = from(place - 3.0 * DVec3::X, place + DVec3::new(0.0, 0.1, -0.1));

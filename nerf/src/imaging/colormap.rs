@@ -69,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn viridis_agrees_with_the_table() {
+    fn viridis_equals_matplotlib() {
         // matplotlib's `viridis` at entries 0, 64, 128, 192 and 255 of 255.
         let table = [
             (0, [0.267004, 0.004874, 0.329415]),
@@ -86,13 +86,13 @@ mod tests {
     }
 
     #[test]
-    fn lightness_grows() {
+    fn viridis_lightness_rises() {
         let luma = |t: f32| viridis(t).iter().zip([0.2126, 0.7152, 0.0722]).map(|(c, w)| c * w).sum::<f32>();
         assert!((0..100).all(|i| luma(i as f32 / 100.0) < luma((i + 1) as f32 / 100.0)));
     }
 
     #[test]
-    fn depth_runs_from_yellow_to_violet() {
+    fn depth_map_runs_from_yellow_to_violet() {
         let map = depth_map(&grey(&[2.0, 4.0, 6.0, 0.0, f32::INFINITY, f32::NAN]), 2.0, 6.0);
         let expected = [1.0, 0.5, 0.0, f32::NAN, 0.0, f32::NAN].map(viridis);
         assert_eq!(map.data, expected.concat());
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn error_is_averaged_and_saturates() {
+    fn error_map_averages_and_saturates() {
         let rgb = |data: [f32; 3]| Image { width: 1, height: 1, channels: 3, data: data.to_vec() };
         let map = |a, b| error_map(&rgb(a), &rgb(b)).data;
         assert_eq!(map([0.5; 3], [0.5; 3]), viridis(0.0));

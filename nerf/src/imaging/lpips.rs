@@ -33,7 +33,7 @@ impl fmt::Display for Backbone {
 /// A convolution with a bias and a ReLU.
 #[derive(Clone, Copy)]
 struct Convolution {
-    /// Its number among torchvision's `features`.
+    /// Its index in torchvision's `features`.
     layer: usize,
     outputs: usize,
     kernel: usize,
@@ -41,19 +41,18 @@ struct Convolution {
     padding: usize,
 }
 
-/// One that keeps the extents.
+/// A convolution with stride 1 that keeps the extents.
 const fn same(layer: usize, outputs: usize, kernel: usize) -> Convolution {
     Convolution { layer, outputs, kernel, stride: 1, padding: kernel / 2 }
 }
 
-/// A network, whose features are compared at the ends of five slices.
+/// A network with the features of five slices.
 struct Network {
-    /// For each slice the window of the max pooling before it, every second one of which is taken, and its
-    /// convolutions.
+    /// For each slice, the window of the max pooling before it (stride 2), and its convolutions.
     slices: [(Option<usize>, &'static [Convolution]); 5],
     smallest: usize,
     bytes: f64,
-    /// A tensor that only this network has.
+    /// A tensor that this network alone has.
     sign: &'static str,
 }
 
@@ -101,15 +100,15 @@ impl Backbone {
     }
 }
 
-/// Longest file that is read, in bytes: the weights of VGG-16 are 59 MB.
+/// The largest weights file, in bytes. VGG-16 takes 59 MB.
 const LONGEST: u64 = 1 << 27;
-/// What to do where a file does not serve.
+/// The remedy for an unusable file.
 const MAKE: &str = "make the file with benches/peers/lpips_weights.py";
 
-/// The mean and standard deviation of images from -1 to 1, per channel, as in the package.
+/// The mean and standard deviation of images from -1 to 1, per channel, as in the authors' package.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
-/// Added to the length of features before they are divided by it.
+/// Added to the length of features before the division by it.
 const EPSILON: f64 = 1e-10;
 
 /// LPIPS weights, which compute a perceptual distance: 0 for identical images, up to about 1.
@@ -128,12 +127,12 @@ pub struct Lpips<T: Scalar = f32> {
     slices: Vec<Slice<T>>,
 }
 
-/// A part of the network, and what its features count.
+/// A slice of the network, and the weights of its features.
 #[derive(Debug, Clone)]
 struct Slice<T: Scalar> {
     pool: Option<Pool2dConfig>,
     convolutions: Vec<(Conv2dConfig, Tensor<T>, Tensor<T>)>,
-    /// One weight a channel.
+    /// One weight per channel.
     shares: Tensor<T>,
 }
 
@@ -188,7 +187,7 @@ impl Lpips<f32> {
     }
 }
 
-/// A tensor of a file whose numbers are finite and not less than `least`; or what is wrong with it.
+/// A tensor of a file, checked to be finite and at least `least`; or an error message.
 fn tensor(file: &SafeTensors<'_>, name: &str, shape: &[usize], least: f32) -> std::result::Result<Tensor<f32>, String> {
     let Ok(found) = file.tensor(name) else { return Err(format!("is missing, should be F32{shape:?}")) };
     if found.dtype() != Dtype::F32 || found.shape() != shape {
@@ -233,7 +232,7 @@ impl<T: Scalar> Lpips<T> {
     pub fn distance(&self, a: &Image, b: &Image) -> f64 {
         a.assert_same_shape(b);
         assert_eq!(a.channels, SHIFT.len(), "LPIPS needs three channels: red, green and blue");
-        // AlexNet's first windows leave out up to three columns and rows at the end.
+        // AlexNet's first convolution ignores up to three columns and rows at the end, so NaN there would go unnoticed.
         if a.data.iter().chain(&b.data).any(|value| value.is_nan()) {
             return f64::NAN;
         }
@@ -289,7 +288,7 @@ impl<T: Scalar> Lpips<T> {
         let [shift, scale] = [SHIFT, SCALE].map(|x| Tensor::from_fn(&[3, 1, 1], |i| T::from_f64(x[i].into())));
         let mut features = [a, b].map(|x| (x * 2.0 - 1.0 - &shift) / &scale);
         let each = |slice: &Slice<T>| {
-            // One image after the other, so that they need the space of what is between only once.
+            // One image after the other, so that both use the same memory for intermediate features.
             features.iter_mut().for_each(|x| *x = slice.features(x));
             slice.distance(&features)
         };

@@ -30,7 +30,7 @@ pub fn psnr(a: &Image, b: &Image) -> f64 {
 
 /// Computes the PSNR in dB from a mean squared error, for a peak of 1; 0 gives +infinity.
 pub fn psnr_from_mse(mse: f64) -> f64 {
-    // The reciprocal rather than a minus sign: an error of 1 is 0 dB, not -0.
+    // The reciprocal instead of a minus sign: an error of 1 is 0 dB, not -0.
     10.0 * mse.recip().log10()
 }
 
@@ -59,10 +59,9 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
     let fits = a.width >= SSIM_WINDOW && a.height >= SSIM_WINDOW;
     assert!(fits, "SSIM needs at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, the images have {}x{}", a.width, a.height);
 
-    // In terms of s = a + b and d = a - b,
-    //     2 mu_a mu_b = (mu_s^2 - mu_d^2) / 2   and   mu_a^2 + mu_b^2 = (mu_s^2 + mu_d^2) / 2,
-    // and likewise for the variances. Two moments are needed in place of five, and as none of these terms is negative,
-    // no rounding can lift the quotient above 1.
+    // With s = a + b and d = a - b, 2 mu_a mu_b = (mu_s^2 - mu_d^2) / 2 and mu_a^2 + mu_b^2 = (mu_s^2 + mu_d^2) / 2;
+    // the same holds for variances. This takes two moments instead of five. No term is negative, so rounding cannot
+    // lift the quotient above 1.
     let weights = gaussian();
     let sums = row_moments(a, b, &weights, |a, b| a + b);
     let differences = row_moments(a, b, &weights, |a, b| a - b);
@@ -83,7 +82,7 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
     totals.iter().sum::<f64>() / (places[0] * places[1] * a.channels) as f64
 }
 
-/// Weighted means and variances, one for each place and channel of a row.
+/// Weighted means and variances, per position and channel of a row.
 struct Moments {
     mean: Vec<f64>,
     variance: Vec<f64>,
@@ -97,7 +96,7 @@ impl Moments {
 
 /// The moments of `f(a, b)` in windows of one row, for every row.
 ///
-/// The Gaussian window is a product, so it is taken along rows, and then [`combine`] takes it down the columns.
+/// The Gaussian window is separable: this is the pass along rows, and [`combine`] also does the one along columns.
 fn row_moments(a: &Image, b: &Image, weights: &Weights, f: fn(f64, f64) -> f64) -> Vec<Moments> {
     let row_length = a.width * a.channels;
     let out_length = row_length - (SSIM_WINDOW - 1) * a.channels;
@@ -110,10 +109,10 @@ fn row_moments(a: &Image, b: &Image, weights: &Weights, f: fn(f64, f64) -> f64) 
     parallel::collect(a.height, moments)
 }
 
-/// Weights of the window along one axis; they sum to 1.
+/// Weights of the window along one axis, with the sum 1.
 type Weights = [f64; SSIM_WINDOW];
 
-/// The Gaussian window of standard deviation 1.5.
+/// The Gaussian window with a standard deviation of 1.5.
 fn gaussian() -> Weights {
     const SIGMA: f64 = 1.5;
     let centre = (SSIM_WINDOW / 2) as f64;
@@ -122,10 +121,10 @@ fn gaussian() -> Weights {
     weights.map(|w| w / total)
 }
 
-/// Moments of a whole from the means and variances of its parts, element by element.
+/// Element-wise moments of a whole from the means and variances of its parts.
 ///
-/// The variance of a whole is the mean of the variances of its parts plus the variance of their means: centred, where
-/// the textbook's E[x^2] - mu^2 cancels and comes out negative in flat regions.
+/// The variance of a whole is the mean of the variances of its parts plus the variance of their means. The textbook's
+/// E[x^2] - mu^2 would cancel and become negative in flat regions.
 fn combine(weights: &Weights, parts: [(&[f64], &[f64]); SSIM_WINDOW]) -> Moments {
     let length = parts[0].0.len();
     let (mut mean, mut variance) = (vec![0.0; length], vec![0.0; length]);
@@ -160,7 +159,7 @@ mod tests {
         Image { data, ..*base }
     }
 
-    /// The definition, window by window in two dimensions.
+    /// SSIM by its definition, window by window in two dimensions.
     fn ssim_by_definition(a: &Image, b: &Image) -> f64 {
         let weight = |dx: usize, dy: usize| {
             let squared = (dx as f64 - 5.0).powi(2) + (dy as f64 - 5.0).powi(2);
@@ -190,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn psnr_of_known_errors() {
+    fn psnr_of_known_errors_is_exact() {
         let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-5, "{a} for {b}");
         close(psnr(&constant(0.5), &constant(0.6)), 20.0);
         close(psnr(&constant(0.25), &constant(0.26)), 40.0);
@@ -209,8 +208,8 @@ mod tests {
     }
 
     #[test]
-    fn ssim_of_constants() {
-        // Variances vanish: what is left is the luminance term.
+    fn ssim_of_constants_is_the_luminance_term() {
+        // Variances are 0, so the luminance term alone remains.
         let got = ssim(&constant(0.25), &constant(0.75));
         assert!((got - (2.0 * 0.25 * 0.75 + 1e-4) / (0.0625 + 0.5625 + 1e-4)).abs() < 1e-12, "{got}");
     }
@@ -227,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn ssim_agrees_with_its_definition() {
+    fn ssim_equals_its_definition() {
         for (seed, scale) in [(1, 1.0), (2, 0.3), (3, 1e-2), (4, 1e-5)] {
             let a = noise(seed, &constant(0.5), 1.0);
             let b = noise(seed + 100, &a, scale);
@@ -237,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn nan_is_no_good_score() {
+    fn metrics_of_nan_are_nan() {
         let (good, mut bad) = (constant(0.5), constant(0.5));
         bad.data[100] = f32::NAN;
         for metric in [mse, psnr, ssim] {
@@ -247,13 +246,13 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "images must have the same height, width and channels")]
-    fn other_shapes_are_refused() {
+    fn metrics_of_different_shapes_panic() {
         psnr(&Image::new(2, 3, 3), &Image::new(3, 2, 3));
     }
 
     #[test]
     #[should_panic(expected = "SSIM needs at least 11x11 pixels, the images have 12x10")]
-    fn ssim_needs_a_window() {
+    fn ssim_of_too_small_images_panics() {
         ssim(&Image::new(12, 10, 1), &Image::new(12, 10, 1));
     }
 

@@ -12,7 +12,7 @@ use crate::files::write_atomic;
 
 /// Quantises a value to a byte: `round(255 clamp(x, 0, 1))`. NaN becomes 0.
 pub fn quantise(value: f32) -> u8 {
-    // A float cast to an integer turns NaN into 0.
+    // A cast from float to integer turns NaN into 0.
     (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
@@ -88,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quantises_to_the_nearest_byte() {
+    fn bytes_are_rounded_to_nearest() {
         let cases = [(0.0, 0), (1.0, 255), (-0.5, 0), (7.0, 255), (0.5, 128), (0.499 / 255.0, 0), (0.501 / 255.0, 1)];
         for (value, byte) in cases {
             assert_eq!(quantise(value), byte, "{value}");
@@ -98,9 +98,9 @@ mod tests {
     }
 
     #[test]
-    fn a_jpeg_is_of_a_size_and_channels_that_it_may_have() {
+    fn jpeg_of_unsupported_size_or_channels_panics() {
         for channels in [1, 3] {
-            // Even areas, of which nothing is lost but the last digits.
+            // Constant areas, of which JPEG loses only the last digit.
             let data = [0.25, 0.75].iter().flat_map(|value| vec![*value; 8 * 8 * channels]).collect();
             let jpeg = Image { width: 8, height: 16, channels, data }.to_jpeg(95);
             let read = image::load_from_memory_with_format(&jpeg, image::ImageFormat::Jpeg).unwrap().to_rgb8();
@@ -129,7 +129,7 @@ mod tests {
             image.save_png(&path).unwrap();
             assert_eq!(Image::open(&path).unwrap(), image);
         }
-        // Grey is read back as RGB.
+        // A reader returns grey as RGB.
         let path = folder.path().join("grey.png");
         Image { width: 2, height: 1, channels: 1, data: vec![0.0, 1.0] }.save_png(&path).unwrap();
         assert_eq!(Image::open(&path).unwrap().data, [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]);
@@ -138,7 +138,7 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "1, 3 or 4 channels, not 2")]
-    fn two_channels_are_not_a_png() {
+    fn png_of_two_channels_panics() {
         Image::new(1, 1, 2).to_png();
     }
 }

@@ -30,7 +30,7 @@ pub fn interlevel<'t, T: Scalar>(
         let edges = &level.edges[bins.start + ray..=bins.end + ray];
         for row in rows {
             let (middle, half) = (t[row].to_f64(), 0.5 * delta[row].to_f64());
-            // The bins that hold the ends; rounding must not leave them.
+            // The bins of the ends, clamped because rounding may leave the histogram.
             let low = edges.partition_point(|&edge| edge <= middle - half).clamp(1, bins.len());
             let high = edges.partition_point(|&edge| edge < middle + half).clamp(low, bins.len());
             first.push((bins.start + low - 1) as u32);
@@ -74,7 +74,7 @@ mod tests {
         let samples = |t: [f64; 3], delta: [f64; 3]| {
             Samples::new(&rays(2), Segments::new([0, 2, 3]), Tensor::from(t), Tensor::from(delta), &pool)
         };
-        // Of the first ray [.5, 1.5] and [2, 4]; of the second [.5, 1], exactly a bin.
+        // The first ray has [0.5, 1.5] and [2, 4]; the second has [0.5, 1], which is exactly a bin.
         let at = samples([1.0, 3.0, 0.75], [1.0, 2.0, 0.5]);
         let weights = Tensor::from([0.5, 0.25, 0.75]);
         let good = level([0.25, 0.25, 0.25, 0.0, 0.75, 0.0]);

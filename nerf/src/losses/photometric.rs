@@ -51,14 +51,14 @@ mod tests {
     use raygrad_autograd::Tape;
     use raygrad_autograd::check::{Check, check_function};
 
-    /// Colours, and what they should be.
+    /// Colours and their targets.
     fn pixels() -> [Tensor<f64>; 2] {
         let rendered = vec![0.5, 0.55, 0.61, 0.5, 0.44, 0.39, 1.0, 0.0, 0.62];
         [Tensor::from_vec(&[3, 3], rendered), Tensor::full(&[3, 3], 0.5)]
     }
 
     #[test]
-    fn huber_is_the_square_and_then_a_line() {
+    fn huber_is_square_then_linear() {
         let tape = Tape::new();
         let [rendered, target] = pixels();
         let sum = |loss: Loss| loss.sum(&tape.constant(rendered.clone()), &target).item();
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_what_differences_show() {
+    fn photometric_gradients_equal_differences() {
         let [rendered, target] = pixels();
         for loss in [Loss::Mse, Loss::Huber { delta: 0.1 }] {
             let report =
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_are_words_or_have_a_range() {
+    fn photometric_settings_are_checked() {
         let read = |text: &str| serde_json::from_str::<Loss>(text);
         assert_eq!(read(r#""mse""#).unwrap(), Loss::Mse);
         assert_eq!(read(r#"{"huber": {"delta": 0.1}}"#).unwrap(), Loss::Huber { delta: 0.1 });

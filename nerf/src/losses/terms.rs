@@ -56,7 +56,7 @@ pub struct DepthConfig {
     pub weight: f64,
 }
 
-/// Terms whose configuration is the term itself.
+/// Implements terms whose configuration is the term itself.
 macro_rules! terms {
     ($($kind:literal $config:ty),*) => {
         $(impl ComponentConfig<LossTerms> for $config {
@@ -89,12 +89,12 @@ impl ComponentConfig<LossTerms> for DistortionConfig {
 /// The distortion loss with its scale of distances.
 struct Evenness {
     weight: f64,
-    /// Half the side of an unbounded scene's box: beyond it, distances count by their inverses.
+    /// Half of the side of an unbounded scene's box: beyond it distances are inverted.
     reach: Option<f64>,
 }
 
 impl Evenness {
-    /// A distance as a rising share of the span.
+    /// Maps a distance to a share of the span, monotonically.
     fn place(&self, distance: f64, [near, far]: [f64; 2]) -> f64 {
         match self.reach {
             None => (distance - near) / (far - near).max(1e-12),
@@ -119,7 +119,7 @@ impl ComponentConfig<LossTerms> for DepthConfig {
 /// The depth loss.
 struct Depth {
     weight: f64,
-    /// The length that errors are measured by, in scene units.
+    /// The unit of errors, in scene units.
     unit: f64,
 }
 
@@ -131,9 +131,9 @@ impl<T: Scalar> LossTerm<T> for Evenness {
             let span = span.map(T::to_f64);
             for (t, delta) in samples.t.as_slice()[rows.clone()].iter().zip(&samples.delta.as_slice()[rows]) {
                 let (t, half) = (t.to_f64(), 0.5 * delta.to_f64());
-                // A sample may stand for an interval that ends beyond the span.
+                // A sample's interval may end beyond the span.
                 let [start, end] = [(t - half).max(0.0), t + half].map(|distance| self.place(distance, span));
-                // Intervals of any lengths may overlap; places rise.
+                // Intervals of any lengths may overlap; the midpoints rise.
                 middles.push(T::from_f64(self.place(t, span)));
                 lengths.push(T::from_f64(end - start));
             }
@@ -146,7 +146,7 @@ impl<T: Scalar> LossTerm<T> for Evenness {
 
 impl<T: Scalar> LossTerm<T> for EntropyConfig {
     fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
-        // With x the optical depth, ln(1 - o) = -x: exact where the ray is opaque, and o keeps its digits where it is thin.
+        // With the optical depth x, ln(1 - o) = -x. It is exact for opaque rays, and o is precise for thin ones.
         let (opacity, x) = (seen.rendered.opacity(), &seen.rendered.optical_depth);
         let met = &opacity * opacity.maximum(1e-20).ln();
         let left = seen.rendered.transmittance() * x.minimum(1e3);
@@ -207,7 +207,7 @@ mod tests {
     use raygrad_autograd::check::{Check, check_function};
     use raygrad_nn::{Bound, Params};
 
-    /// A density that rises or falls along z, with two parameters: how much there is, and how steep it is.
+    /// A log density that is linear in z, with two parameters: its value at 0 and its slope.
     struct Slope;
 
     impl<T: Scalar> Field<T> for Slope {
@@ -226,7 +226,7 @@ mod tests {
         value_at(term, x, 0.65)
     }
 
-    /// The same, with this distance measured along the first ray, and none along the second.
+    /// The same with this distance measured for the first ray, and none for the second.
     fn value_at<'t>(term: &dyn LossTerm<f64>, x: &[Var<'t, f64>], distance: f64) -> Var<'t, f64> {
         let mut params = Params::<f64>::new();
         params.add("much", Tensor::scalar(0.0));
@@ -259,27 +259,27 @@ mod tests {
                 check_function(&Check::default(), &[Tensor::scalar(0.3), Tensor::scalar(0.4)], |x| value(term, x));
             assert!(report.is_ok(), "term {i}: {report:?}");
         }
-        // A thin fog is spread over the span, a thick one stands at its front.
+        // Thin fog is spread over the span; thick fog absorbs at its start.
         assert!(at(terms[0], 0.0, 0.0) > 2.0 * at(terms[0], 6.0, 0.0));
         assert!((at(terms[0], 0.5, 0.2) - 2.0 * at(&Evenness { weight: 1.0, reach: None }, 0.5, 0.2)).abs() < 1e-12);
-        // A wall in the first of five bins has its own length alone, a third of a fifth of the span, for both rays.
+        // A wall in the first of five bins has its own length alone: a third of a fifth of the span, for both rays.
         assert!((at(terms[0], 9.0, 0.0) - 2.0 * 2.0 / 15.0).abs() < 1e-6, "{}", at(terms[0], 9.0, 0.0));
-        // Of an unbounded scene, half of whose box is 1.1 wide: up to there evenly, then by inverses, and up to 1.
+        // An unbounded scene with half a box of 1.1: linear up to there, then inverse, with the limit 1.
         let unbounded = Evenness { weight: 2.0, reach: Some(1.1) };
         let places = [0.0, 0.55, 1.1, 2.2, 1e9].map(|distance| unbounded.place(distance, [0.5, 2.0]));
         assert!(places.iter().zip([0.0, 0.25, 0.5, 0.75, 1.0]).all(|(a, b)| (a - b).abs() < 1e-9), "{places:?}");
-        // The walls' bins, of .3 and .25, are so many 2.2ths of that.
+        // The walls' bins have the lengths 0.3 and 0.25, over 2.2.
         assert!((at(&unbounded, 9.0, 0.0) - 2.0 / 3.0 * 0.55 / 2.2).abs() < 1e-6, "{}", at(&unbounded, 9.0, 0.0));
-        // Nothing and a wall have no entropy; at an opacity of a half each ray has ln 2, in halves of it.
+        // Empty rays and walls have no entropy. At an opacity of 0.5 each ray has ln 2, with the weight 0.5.
         assert!(at(terms[1], -60.0, 0.0).abs() < 1e-12 && at(terms[1], 9.0, 0.0).abs() < 1e-12);
         let half = (2.0_f64.ln() / 1.5).ln();
         assert!((0.6..0.7).contains(&at(terms[1], half, 0.0)), "the second ray is a little shorter");
-        // What grows denser along the ray faces the viewer; what grows thinner faces away with all of its weight.
+        // Density that rises along the ray faces the viewer; density that falls faces away with all of its weight.
         assert_eq!(at(terms[2], 0.0, 1.0), 0.0);
         let opacity = at(&Opacity, 0.0, -1.0);
         assert!((at(terms[2], 0.0, -1.0) - 3.0 * opacity).abs() < 1e-9 && opacity > 0.5, "{opacity}");
-        // A wall in the first bin, from .5 to .8 of a span to 2, is where it was measured, or so far from it, before or
-        // behind; of a ray that meets nothing all light counts as from the far end.
+        // A wall in the first bin, from 0.5 to 0.8, has no error if it was measured within it; otherwise the error is
+        // its distance. The light of a ray without density counts as from the far end.
         assert!(at(terms[3], 9.0, 0.0).abs() < 1e-6, "{}", at(terms[3], 9.0, 0.0));
         let far = (1.35_f64 / 1.6).powi(2);
         assert!((at(terms[3], -60.0, 0.0) - 4.0 * far).abs() < 1e-6, "{}", at(terms[3], -60.0, 0.0));
@@ -298,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn a_distortion_knows_whether_the_scene_goes_on() {
+    fn distortion_depends_on_unbounded_scenes() {
         let config = DistortionConfig { weight: 2.0 };
         let space = Space::within([DVec3::splat(-1.1), DVec3::splat(1.1)]);
         for (unbounded, reach) in [(false, None), (true, Some(1.1))] {
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn orientation_knows_the_axes_of_normals_and_rays() {
+    fn orientation_uses_one_frame_for_normals_and_rays() {
         let params = Params::<f64>::new();
         let tape = Tape::new();
         let bound = params.bind(&tape);

@@ -39,7 +39,7 @@ fn draws() -> usize {
     1
 }
 
-/// Rows that a table may have beyond its cells, less than so many.
+/// A table may have fewer than this many rows beyond its cells.
 const PADDING: usize = 64;
 
 impl ComponentConfig<LossTerms> for TotalVariationConfig {
@@ -81,7 +81,7 @@ impl ComponentConfig<LossTerms> for TotalVariationConfig {
 /// The term of one table.
 struct TotalVariation {
     id: ParamId,
-    /// Along each axis, the slowest first.
+    /// The number of cells along each axis, the slowest first.
     cells: Vec<usize>,
     channels: usize,
     draws: usize,
@@ -89,7 +89,8 @@ struct TotalVariation {
 }
 
 impl TotalVariation {
-    /// Numbers of random cells, and of the next ones along each axis: at the end of an axis the cell itself.
+    /// The indices of random cells, and of the next cells along each axis. At the end of an axis the next cell is the
+    /// cell itself.
     fn pairs(&self, count: usize, seed: u64) -> [Vec<u32>; 2] {
         let rows: usize = self.cells.iter().product();
         let rng = &mut stream(seed, [0, 0]);
@@ -112,7 +113,7 @@ impl<T: Scalar> LossTerm<T> for TotalVariation {
     fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
         let pairs = self.pairs(self.draws * seen.rays.len(), seen.seed);
         let table = &seen.params[self.id];
-        // A gradient of rows stays one where nothing lies in between.
+        // Without an operation in between, the gradient stays one of rows.
         let all = table.value().len() / self.channels.max(1);
         let flat = if table.shape().len() == 2 { table.clone() } else { table.reshape(&[all, self.channels]) };
         let [cells, next] = pairs.map(|index| flat.gather_rows(index));
@@ -142,7 +143,7 @@ mod tests {
         config.build(BuildContext { space, frames: 0, params, name: "terms", rng: &mut Pcg64Mcg::seed_from_u64(0) })
     }
 
-    /// The term for `count` rays that meet nothing.
+    /// The term for `count` empty rays.
     fn value<'t>(
         term: &dyn LossTerm<f64>,
         params: &raygrad_nn::Bound<'t, f64>,
@@ -182,7 +183,7 @@ mod tests {
             let expected = 2.0 * sum / 60.0;
             let tape = Tape::new();
             let bound = params.bind(&tape);
-            // 200 times 1024 draws.
+            // 200 batches of 1024 draws.
             let found = (0..20).map(|seed| value(&*term, &bound, 10, seed).item()).sum::<f64>() / 200.0;
             assert!((found / expected - 1.0).abs() < 0.01, "{found} {expected}");
             assert!(value(&*term, &bound, 1, 0).item() != value(&*term, &bound, 1, 1).item(), "other cells each time");
@@ -192,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_what_differences_show() {
+    fn total_variation_gradients_equal_differences() {
         let mut params = Params::<f64>::new();
         params.add("field.table", Tensor::zeros(&[2, 3, 2]));
         let term = build(&TotalVariationConfig { draws: 5, ..config(None) }, &mut params).unwrap();

@@ -21,30 +21,30 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// Cascades of an unbounded scene, each twice as large as the one before.
+/// Cascades of an unbounded scene; each is twice as large as the one before.
 const CASCADES: usize = 6;
-/// Cells along each axis of each of them.
+/// Cells along each axis of a cascade.
 const RESOLUTION: usize = 32;
-/// Steps through an unbounded scene, in training and in renders, as shares of the box's side.
+/// Step lengths in an unbounded scene, in training and in renders, as shares of the box's side.
 const STEP: f64 = 1.0 / 100.0;
 const VIEW_STEP: f64 = 1.0 / 150.0;
-/// Samples of a training step, for each of one within a box: most of them lie behind what is opaque, and cost little.
+/// The factor of the samples per step in unbounded scenes: most of them are behind opaque parts and cost little.
 const SAMPLES: usize = 4;
-/// How much longer they are for each unit of distance.
+/// Growth of the steps per unit of distance.
 const CONE: f64 = 1.0 / 64.0;
-/// Weight of the distortion loss in unbounded scenes, where few images show each place.
+/// Weight of the distortion loss in unbounded scenes, where few images show each point.
 const DISTORTION: f64 = 0.1;
 
-/// Learning rates of cameras, at the beginning of a run and at its end: radians that an image moves by, logarithms of
-/// focal lengths, coefficients of lenses.
+/// Learning rates of cameras at the start and the end of a run. Units: radians of image motion, logarithms of focal
+/// lengths, lens coefficients.
 const POSE_RATE: [f64; 2] = [3e-3, 3e-5];
 const FOCAL_RATE: [f64; 2] = [5e-3, 5e-5];
 const LENS_RATE: [f64; 2] = [1e-3, 1e-5];
-/// Those of the logarithms of gains.
+/// Learning rates of the logarithms of gains.
 const TONE_RATE: [f64; 2] = [1e-2, 1e-4];
-/// The share of a run over which these rates rise from 0: before there is a scene, cameras drift.
+/// The share of a run over which these rates rise from 0: cameras would drift before the scene takes shape.
 const CAMERA_WARMUP: f64 = 0.1;
-/// The share of a run in which poses are learned over which detail comes in.
+/// The share of a run over which detail is enabled while poses are learned.
 const COARSE: f64 = 0.4;
 
 /// A named configuration, for [`Config::preset`].
@@ -316,7 +316,7 @@ impl Config {
         self
     }
 
-    /// The schedule of the parameter of this name, if it is one of the camera optimizer or the exposure model.
+    /// The schedule of the camera optimizer or exposure model for the parameter `name`, if it belongs to them.
     pub(crate) fn camera_rate(&self, name: &str) -> Option<Schedule> {
         match name {
             POSES => self.poses,
@@ -333,7 +333,7 @@ impl Config {
         if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
             marching.occupancy.skip = skip.into();
         } else if skip != Skip::Off {
-            // As many rays as before, once a few samples are left of each.
+            // The same number of rays as before, if about 16 samples of each remain.
             let batch = self.sampler.get::<HierarchicalConfig>().map(|hierarchical| hierarchical.batch);
             let usual = MarchingConfig::default();
             let mut marching = MarchingConfig { samples: batch.map_or(usual.samples, |batch| 16 * batch), ..usual };
@@ -414,7 +414,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_part_that_is_refined_has_a_rate_of_its_own() {
+    fn refined_params_have_their_own_schedule() {
         let refined = |part| Config::preset(Preset::Instant).with_refined(&[part]);
         let rate = |from, to| Some(Schedule::Exponential { from, to, warmup: 0.1 });
         let expected = [
@@ -432,7 +432,7 @@ mod tests {
             }
             assert_eq!(config.camera_rate("field.table"), None);
             assert_eq!((part.to_string(), name.parse::<RefinedParam>().unwrap()), (name.to_owned(), part));
-            // Detail comes in slowly while poses are learned, and only then.
+            // Only with pose refinement is detail enabled gradually.
             let coarse = if part == RefinedParam::Poses { 0.4 } else { 0.0 };
             assert_eq!(config.camera_optimizer.coarse, coarse);
             let details = [0.0, 0.1, 0.4, 1.0].map(|fraction| config.camera_optimizer.detail(fraction));
@@ -466,12 +466,12 @@ mod tests {
         assert_eq!(made(2.5e8, 400.0), (18, 512, samples, Some(1.0 / 400.0)));
         assert_eq!(made(6.5e8, 1000.0), (19, 768, 2 * samples, Some(1.0 / 450.0)));
         assert_eq!(made(6.5e8, 100.0), (19, 200, 2 * samples, Some(1.0 / 150.0)));
-        // What has no grid stays as it is.
+        // Presets without a grid do not change.
         assert_eq!(Config::preset(Preset::Classic).for_budget(1e9, 50.0), Config::preset(Preset::Classic));
     }
 
     #[test]
-    fn a_scope_changes_what_a_scene_asks_for_once() {
+    fn scene_type_changes_the_config_once() {
         let preset = Config::preset(Preset::Instant);
         let unbounded = preset.clone().with_scene_type(SceneType::Unbounded);
         unbounded.check().unwrap();
@@ -489,14 +489,14 @@ mod tests {
         for other in [Preset::Voxel, Preset::Small, Preset::Classic] {
             Config::preset(other).with_scene_type(SceneType::Unbounded).check().unwrap();
         }
-        // As many rays as before, each with more samples.
+        // The same number of rays as before, each with more samples.
         let skipped = Config::preset(Preset::Small).with_skip(Skip::Fast);
         let samples = |config: &Config| config.sampler.get::<MarchingConfig>().unwrap().samples;
         let open = skipped.clone().with_scene_type(SceneType::Unbounded);
         open.check().unwrap();
         assert_eq!((samples(&skipped), samples(&open)), (16 * 256, 4 * 16 * 256));
         assert_eq!(open.with_scene_type(SceneType::Bounded), skipped);
-        // Proposals are spread in inverse distance.
+        // Proposals are spaced in inverse distance.
         let proposal = Config { sampler: SamplerConfig::new(ProposalConfig::default()), ..preset.clone() };
         let spacing = |config: &Config| config.sampler.get::<ProposalConfig>().unwrap().spacing;
         let open = proposal.clone().with_scene_type(SceneType::Unbounded);

@@ -7,9 +7,9 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId, Params, Schedule};
 use serde::{Deserialize, Serialize};
 
-/// The name of the parameter of exposures.
+/// The name of the exposure parameter.
 pub(crate) const EXPOSURE: &str = "exposure";
-/// The name of the parameter of vignetting.
+/// The name of the vignetting parameter.
 pub(crate) const VIGNETTING: &str = "vignetting";
 /// Coefficients of the vignetting polynomial.
 const POWERS: usize = 3;
@@ -63,7 +63,7 @@ pub(crate) struct Gain {
 }
 
 impl ExposureModel {
-    /// A model of gains 1 for this many images; `None` if nothing is learned.
+    /// An exposure model with gains of 1 for `frames` images; `None` if nothing is learned.
     ///
     /// # Errors
     /// If exposures are learned and `frames` is 0.
@@ -78,7 +78,7 @@ impl ExposureModel {
         }
         let exposure = config.exposure.map(|_| params.add(EXPOSURE, Tensor::zeros(&[frames, 3])));
         let vignetting = config.vignetting.map(|_| params.add(VIGNETTING, Tensor::zeros(&[POWERS])));
-        // A step sees few of the images.
+        // Sparse updates, since a step uses few of the images.
         params.set_lazy(|name| name == EXPOSURE, exposure.is_some());
         Ok((exposure.is_some() || vignetting.is_some()).then_some(ExposureModel { exposure, vignetting }))
     }
@@ -100,7 +100,7 @@ impl ExposureModel {
         sum.map_or_else(|| params.tape().constant(Tensor::ones(&[batch.rays.len(), 3])), |sum| sum.exp())
     }
 
-    /// The gain of renders: of the image `look`, or the mean of all.
+    /// The gain of renders: of the image `look`, or the mean of all images.
     ///
     /// # Panics
     /// If `look` is out of range.
@@ -150,11 +150,11 @@ mod tests {
     }
 
     #[test]
-    fn training_and_views_multiply_by_the_same() {
+    fn training_and_renders_have_equal_gains() {
         let (tone, params) = learned();
         let tape = Tape::new();
         let gains = tone.gains(&params.bind(&tape), &batch());
-        // -.4 / 2 + .2 / 4 - .1 / 8, and -.4 + .2 - .1.
+        // -0.4 / 2 + 0.2 / 4 - 0.1 / 8, and -0.4 + 0.2 - 0.1.
         let falloffs = [-0.1625_f64, -0.3, 0.0];
         let exposures = [[-0.5, 0.0, 0.1], [0.1, 0.2, 0.3], [-0.5, 0.0, 0.1]];
         for (ray, (falloff, exposure)) in falloffs.into_iter().zip(exposures).enumerate() {
@@ -165,7 +165,7 @@ mod tests {
                 assert!((view[k] - expected).abs() < 1e-12, "{ray} {k}: {view:?}");
             }
         }
-        // Of no photograph in particular, as bright as all on average, and with bright corners.
+        // Without an image, the mean brightness of all, without vignetting.
         let usual = tone.gain(&params, None, false).at(1.0);
         for (gain, expected) in usual.into_iter().zip([-0.2_f64, 0.1, 0.2]) {
             assert!((gain - expected.exp()).abs() < 1e-12, "{usual:?}");
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn gains_have_the_gradients_that_differences_show() {
+    fn exposure_gradients_equal_differences() {
         let (tone, params) = learned();
         let values: Vec<Tensor<f64>> = params.values().to_vec();
         let report = check_function(&Check::default(), &values, |x| {
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn one_may_be_learned_without_the_other() {
+    fn exposure_and_vignetting_are_independent() {
         for (config, names) in [
             (ExposureConfig::default(), &[][..]),
             (ExposureConfig { exposure: RATE, ..ExposureConfig::default() }, &[EXPOSURE]),

@@ -292,7 +292,7 @@ impl Model<f32> {
     /// without an occupancy grid.
     pub fn set_skip(&mut self, skip: impl Into<Skipping>) {
         if let Some(marching) = self.marching_mut() {
-            // What training left out cannot be put back.
+            // Cells that training skipped stay empty, so these settings stay.
             let Skipping { grid, carving, .. } = marching.config.occupancy.skip;
             marching.config.occupancy.skip = Skipping { grid, carving, ..skip.into() };
             self.finish();

@@ -28,7 +28,7 @@ fn register_all() {
     });
 }
 
-/// Deserialises a value that may hold this crate's components.
+/// Deserialises a value that may contain this crate's components.
 pub(super) fn read<'de, V: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -> Result<V, D::Error> {
     register_all();
     V::deserialize(deserializer)

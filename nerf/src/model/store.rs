@@ -39,31 +39,31 @@ impl Model<f32> {
     pub fn load(path: impl AsRef<Path>, config: Config, extent: SceneBox) -> Result<Self> {
         let bytes = std::fs::read(&path).map_err(|error| Error::file(&path, error))?;
         check_version(&bytes).map_err(|error| Error::file(&path, error))?;
-        // How many parameters there are depends on the cameras.
+        // The number of parameters depends on the cameras.
         let stored = stored_bytes(&bytes, CAMERAS).map_err(|error| Error::file(&path, error))?;
         let cameras = cameras(stored.as_deref()).map_err(|error| Error::file(&path, error))?;
         let mut model = Model::with_cameras(config, extent, &cameras, 0)?;
         let state = model.params.load_safetensors(&bytes).map_err(|error| Error::file(&path, error))?;
         model.sampler.load_state(&state).map_err(|error| Error::file(&path, error))?;
-        // A run that was ended before all of it was there.
+        // Training may have ended before all detail was enabled.
         let detail = stored_bytes(&bytes, DETAIL).map_err(|error| Error::file(&path, error))?;
         let detail = detail.and_then(|bytes| Some(f64::from_le_bytes(bytes.try_into().ok()?)));
         if let Some(detail) = detail.filter(|detail| (0.0..=1.0).contains(detail)) {
             model.set_detail(detail);
         }
-        // A look at the field is not to stand beside the file.
+        // Frees the file's bytes before `finish`, which samples the field.
         drop((bytes, state));
         model.finish();
         Ok(model)
     }
 }
 
-/// The metadata key of the format: `raygrad` and its version. The first edition did not write it.
+/// The metadata key of the format: `raygrad` and its version. The first version did not write it.
 const FORMAT: &str = "format";
-/// The version that is written.
+/// The current version.
 const VERSION: u64 = 1;
 
-/// An error unless this version can be read.
+/// Checks that this version can be read.
 fn check_version(bytes: &[u8]) -> std::result::Result<(), String> {
     let stored = stored_words(bytes, FORMAT).map_err(|error| error.to_string())?;
     let Some(words) = stored.as_deref().and_then(|words| words.strip_prefix("raygrad ")) else { return Ok(()) };
@@ -76,7 +76,7 @@ fn check_version(bytes: &[u8]) -> std::result::Result<(), String> {
     }
 }
 
-/// The name of the training cameras, in files of models that refine cameras.
+/// The name of the training cameras, in files of models with camera refinement.
 const CAMERAS: &str = "cameras";
 /// The name of the share of detail.
 const DETAIL: &str = "detail";
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn files_of_later_versions_are_refused() {
+    fn later_format_version_is_an_error() {
         let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let model = Model::new(voxel(1), extent, 3).unwrap();
         let folder = tempfile::tempdir().unwrap();
@@ -141,10 +141,10 @@ mod tests {
     }
 
     #[test]
-    fn a_voxel_model_comes_back_as_it_was() {
+    fn voxel_model_round_trips() {
         let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let mut model = Model::new(voxel(2), extent, 3).unwrap();
-        // A ball in one corner, so that the occupancy grid has something to remember.
+        // A ball in one corner, so that the occupancy grid is not uniform.
         let table = model.params.find("field.table").unwrap();
         let rows = model.params.get_mut(table).as_mut_slice().chunks_exact_mut(16).enumerate();
         rows.for_each(|(i, row)| row[0] = if i % 21 < 9 && i / 441 < 9 { 4.0 } else { -20.0 });
@@ -175,7 +175,7 @@ mod tests {
         let camera = &cameras_around(4, 12)[1];
         let view = |model: &Model<f32>| model.render(camera, [1.0; 3]).color;
         let whole = view(&model);
-        // Of the coarse field, which says where the other one is sampled.
+        // The coarse field, which places the samples of the other one.
         let coarse = |model: &Model<f32>| {
             let mut out = [0.0; 3];
             let points = [[0.1, -0.7, 0.4], [0.33, 0.2, -0.9], [-0.5, 0.6, 0.1]];
@@ -195,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn stored_cameras_have_to_be_some() {
+    fn invalid_stored_cameras_are_errors() {
         let stored = |change: fn(&mut Camera)| {
             let mut camera = cameras_around(1, 8)[0].clone();
             change(&mut camera);
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn sixteen_bits_take_half_of_the_file() {
+    fn sixteen_bits_halve_the_file() {
         let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
@@ -224,7 +224,7 @@ mod tests {
             (path.metadata().unwrap().len() as f64, count as f64)
         });
         let [(full, count), (f16, _), (bf16, _)] = sizes;
-        // What remains beside the parameters is the occupancy grid and some names.
+        // Beside parameters, the file holds the occupancy grid and some names.
         assert!((full - f16 - 2.0 * count).abs() < 100.0 && (f16 - bf16).abs() < 100.0, "{sizes:?}");
     }
 

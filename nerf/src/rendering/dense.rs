@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn single_precision_shows_what_double_shows() {
+    fn single_precision_render_equals_double() {
         let model = ball();
         let double = model.cast::<f64>().unwrap();
         let camera = &cameras_around(4, 20)[1];
@@ -119,7 +119,7 @@ mod tests {
             let errors = pairs.flat_map(|(a, b)| which.clone().map(move |i| (a[i] - b[i]).abs()));
             errors.fold(0.0_f64, Real::maximum)
         };
-        // Densities are up to e^2, distances around 4.
+        // Densities are up to e^2, and distances around 4.
         let (colour, all) = (worst(&single, 0..3), worst(&single, 0..5));
         println!("f32 against f64 at the same samples: colours {colour:.1e}, with distances {all:.1e}");
         assert!(colour > 0.0 && colour <= 1e-6 && all <= 1e-5, "{colour:e}, {all:e}");
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn every_quadrature_shows_the_same_scene() {
+    fn quadratures_render_the_same_image() {
         let mut model = ball();
         let camera = &cameras_around(4, 20)[1];
         let reference = model.cast::<f64>().unwrap().render_reference(camera, [1.0; 3], 4).picture();
@@ -156,7 +156,7 @@ mod tests {
             let worst = differences.fold(0.0, Real::maximum);
             println!("{rule:16} {worst:.1e} {:?}", seen.evaluations);
             assert!(worst <= 1e-2 && seen.evaluations.density > 0, "{rule}: {worst}");
-            // Distances where most of the light is blocked.
+            // Distances are compared only where the render is nearly opaque.
             let solid = (0..seen.depth.data.len()).filter(|&i| reference.opacity.data[i] > 0.5);
             let far = solid.map(|i| (seen.depth.data[i] - reference.depth.data[i]).abs());
             let (count, worst) = far.fold((0, 0.0), |(n, worst), x| (n + 1, Real::maximum(worst, x)));

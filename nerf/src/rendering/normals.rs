@@ -9,7 +9,7 @@ use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
 use raygrad_autograd::{Pool, Scalar};
 
-/// Rays per tile: the densities of all their samples are on one tape.
+/// Rays per tile: one tape holds the densities of all their samples.
 const TILE: usize = 64;
 
 impl<T: Scalar> Model<T> {
@@ -77,7 +77,7 @@ mod tests {
     const CENTRE: [f64; 3] = [0.2, -0.1, 0.3];
     const RADII: [f64; 3] = [0.9, 0.6, 0.7];
 
-    /// A solid ellipsoid with a steep surface, whose density or its logarithm falls outwards: `q` is 1 on the surface.
+    /// A solid ellipsoid with a steep surface, whose density or log density falls outwards; `q` is 1 on the surface.
     struct Ellipsoid {
         log: bool,
     }
@@ -106,8 +106,8 @@ mod tests {
     }
 
     #[test]
-    fn normals_are_those_of_the_surface_that_is_seen() {
-        // Wider than high, and looking at it from aside and above.
+    fn normals_equal_those_of_the_visible_surface() {
+        // The image is wider than high; the camera looks from the side and from above.
         let pose = Camera::look_at(DVec3::new(2.0, -3.0, 1.5), DVec3::new(0.1, 0.0, 0.2), DVec3::Z);
         let camera = Camera::from_angle(21, 13, 0.8, pose);
         let local = |point: DVec3| (point - DVec3::from(CENTRE)) / DVec3::from(RADII);
@@ -119,7 +119,7 @@ mod tests {
                 let [x, y] = [pixel % 21, pixel / 21];
                 let ray = camera.pixel_ray(x, y);
                 let found = DVec3::from_slice(&[0, 1, 2].map(|i| f64::from(normals.pixel(x, y)[i])));
-                // Whether a ray meets the surface: a quadratic equation.
+                // The intersection of a ray with the surface, by a quadratic equation.
                 let (origin, direction) = (local(ray.origin), ray.direction / DVec3::from(RADII));
                 let (a, b) = (direction.length_squared(), origin.dot(direction));
                 let root = b * b - a * (origin.length_squared() - 1.0);
@@ -128,7 +128,7 @@ mod tests {
                     assert!(found.length() < 0.02, "{log} {x} {y}: {found}");
                 } else if root > 0.3 * a {
                     hits += 1;
-                    // It is soft: what is seen lies about it, on another ellipsoid around the same centre.
+                    // The surface is soft: the visible one is another ellipsoid around the same centre.
                     let t = f64::from(depth.pixel(x, y)[0]);
                     assert!((t - (-b - root.sqrt()) / a).abs() < 0.1, "{t}");
                     let normal = (local(ray.at(t)) / DVec3::from(RADII)).normalize();

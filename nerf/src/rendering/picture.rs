@@ -23,7 +23,7 @@ pub struct Render {
     pub evaluations: Evaluations,
 }
 
-/// Below this opacity a pixel has no depth.
+/// The opacity below which a pixel has no depth.
 const VISIBLE: f64 = 1e-3;
 
 impl Render {
@@ -61,7 +61,7 @@ impl Render {
         out
     }
 
-    /// Parts of `tile` pixels, row by row.
+    /// Parts of `tile` pixels, row-major.
     pub(crate) fn parts(&mut self, tile: usize) -> impl Iterator<Item = Part<'_>> {
         let [color, depth, opacity] = [&mut self.color, &mut self.depth, &mut self.opacity];
         let rest = depth.data.chunks_mut(tile).zip(opacity.data.chunks_mut(tile));
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_outside_of_a_box_is_not_seen() {
+    fn crop_hides_all_outside_of_the_box() {
         let (model, camera) = (model(), camera(17, 13));
         let whole = model.render(&camera, [1.0; 3]);
         let within = |lower: [f64; 3], upper: [f64; 3]| {
@@ -186,16 +186,16 @@ mod tests {
                 model.normals_cancellable(&camera, &viewing).unwrap(),
             )
         };
-        // A box that is larger than the scene changes nothing, one beside it shows nothing.
+        // A crop larger than the scene changes nothing; one beside it shows nothing.
         let (all, normals) = within([-9.0, -1.0, f64::NEG_INFINITY], [1.0, 9.0, f64::INFINITY]);
         assert!(all.color == whole.color && normals == model.normals(&camera));
         for upper in [[-1.5, 2.0, 2.0], [-3.0, 2.0, 2.0], [0.0, -2.0, 2.0]] {
             let (none, normals) = within([-2.0; 3], upper);
-            // One with its corners the wrong way round too.
+            // The last has its corners swapped.
             let most = |image: &Image| image.data.iter().fold(0.0_f32, |most, x| most.max(x.abs()));
             assert_eq!([most(&none.opacity), most(&normals)], [0.0; 2]);
         }
-        // Left of the middle: half of the picture.
+        // The left half of the image.
         let (left, normals) = within([-2.0; 3], [0.0, 2.0, 2.0]);
         let columns = |image: &Image, x: std::ops::Range<usize>| {
             x.flat_map(|x| (0..13).map(move |y| [x, y])).map(|[x, y]| image.pixel(x, y).to_vec()).collect::<Vec<_>>()
@@ -217,17 +217,17 @@ mod tests {
         };
         for distance in [0.5, 4.0, 30.0] {
             let (opacity, span) = seen([2.0, 6.0], false, distance);
-            // As much of it as if photographs had been taken everywhere.
+            // As if images had been taken at all distances.
             assert_eq!(opacity, seen([0.02, 100.0], false, distance).0, "{distance}");
             assert!(opacity.data[4] > 0.1 && span == [0.02, f64::INFINITY], "{opacity:?} {span:?}");
         }
         assert_eq!(seen([0.0, 6.0], false, 4.0).1, [0.0, f64::INFINITY]);
-        // One that goes on is not known where they are near.
+        // An unbounded scene is unknown near the cameras.
         assert_eq!(seen([2.0, 600.0], true, 4.0).1, [2.0, 600.0]);
     }
 
     #[test]
-    fn tiles_hold_every_pixel_once_and_in_order() {
+    fn tiles_cover_every_pixel_once_in_order() {
         let (model, camera) = (model(), camera(17, 13));
         let viewing = RenderOptions::over([1.0; 3]);
         let mut tiles = vec![(0, Rays::new()); 221_usize.div_ceil(50)];
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_view_ends_when_nobody_wants_it() {
+    fn cancelled_render_stops_early() {
         use std::sync::atomic::{AtomicUsize, Ordering};
         let (model, camera) = (model(), camera(64, 64));
         let asked = AtomicUsize::new(0);

@@ -30,7 +30,7 @@ impl<T: Scalar> Model<T> {
         see(&query, self.sampler.sample(&query, rays, Purpose::View { finer }, &mut Jitter::Middle))
     }
 
-    /// Calls `see` for tiles of `tile` pixels, row by row, on all cores: with the index of the tile's first pixel, its
+    /// Calls `see` for tiles of `tile` pixels, row-major, on all cores, with the index of the tile's first pixel, its
     /// rays and its part of `out`. `None` if it was cancelled.
     pub(crate) fn tiles<P: Send>(
         &self,
@@ -43,7 +43,7 @@ impl<T: Scalar> Model<T> {
         let ([lower, upper], [from, to]) = (self.reach(), viewing.crop);
         let (bounds, count) = ([lower.max(from), upper.min(to)], camera.width * camera.height);
         let [near, far] = self.view_near_far();
-        // Which corner is which is nothing to a ray.
+        // Rays would accept swapped corners, so an empty box gets an empty span.
         let span = [near, if bounds[0].cmplt(bounds[1]).all() { far } else { near }];
         let (pools, seen) = (Scratch::<Pool<T>>::default(), Mutex::new(Some(Evaluations::default())));
         parallel::each_of(out, |which, out| {
@@ -61,7 +61,7 @@ impl<T: Scalar> Model<T> {
         seen.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Renders a camera's pixels, row by row, in tiles of `tile`; `keep` stores a tile's pixels in its part of `out`.
+    /// Renders a camera's pixels, row-major, in tiles of `tile`; `keep` stores a tile's pixels in its part of `out`.
     /// `None` if it was cancelled.
     pub(crate) fn pixels<P: Send>(
         &self,

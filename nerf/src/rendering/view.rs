@@ -11,13 +11,13 @@ use crate::volume::rounds::{FrontToBack, Round, Stretch};
 use crate::volume::weights::Weights;
 use raygrad_autograd::Pool;
 
-/// Samples per chunk of a ray for rules that weight intervals themselves: nodes at chunk ends are evaluated twice.
+/// Samples per chunk of a ray, for rules that weight intervals. Nodes at the ends of chunks are evaluated twice.
 const CHUNK: usize = 16;
 
 /// Weights of the samples of a ray so far.
 #[derive(Clone, Copy, Default)]
 struct Seen {
-    /// Of samples without a colour, and of all samples.
+    /// The weights of samples without a colour, and of all samples.
     uncolored: f32,
     weight: f32,
 }
@@ -42,7 +42,7 @@ impl Model<f32> {
     }
 }
 
-/// Renders samples that stand for one interval each.
+/// Renders with a rule of one sample per interval.
 fn in_rounds(
     query: &Query<'_, '_, f32>,
     samples: &Samples<f32>,
@@ -79,7 +79,7 @@ fn shade(
             let weight = w[row];
             seen.weight += weight;
             out.depth += f64::from(weight * t[row]);
-            // Small weights first come first served, within the budget.
+            // Small weights are left out in order along the ray, within the budget.
             let small = seen.uncolored + weight <= limits.color_budget && 4.0 * weight <= limits.color_budget;
             if small || weight == 0.0 {
                 seen.uncolored += weight;
@@ -101,12 +101,12 @@ fn shade(
     count
 }
 
-/// The query for some of its rays, all with the same appearance.
+/// The query for a number of rays; all have the same appearance.
 fn of_rays<'a, 't>(query: &Query<'a, 't, f32>, rays: usize) -> Query<'a, 't, f32> {
     Query { frames: query.frames.map(|frames| &frames[..rays]), ..*query }
 }
 
-/// Renders with a rule that weights intervals itself, front to back in chunks of samples.
+/// Renders with a rule that weights intervals, front to back in chunks of samples.
 fn in_chunks(
     query: &Query<'_, '_, f32>,
     rule: Quadrature,
@@ -143,7 +143,7 @@ fn finish(out: &mut Pixel, seen: &Seen, depth: f64, ended: bool) {
     let colored = f64::from(seen.weight - seen.uncolored);
     out.transmittance = (-depth).exp();
     if colored > 0.0 {
-        // The remaining light is attributed to what is in front.
+        // The remaining light is attributed to the samples in front.
         let total = if ended { 1.0 } else { f64::from(seen.weight) };
         out.color.iter_mut().for_each(|value| *value *= total / colored);
         if ended {

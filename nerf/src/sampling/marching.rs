@@ -55,7 +55,7 @@ impl Default for MarchingConfig {
             occupancy,
             step: 1.0 / 200.0,
             last_step: None,
-            // Figures are in docs/benchmarks/results.md, section Rendering.
+            // docs/benchmarks/results.md, section Rendering, has the figures.
             view_step: 1.0 / 600.0,
             cone: 0.0,
             samples: 24576,
@@ -85,7 +85,7 @@ impl ComponentConfig<Samplers> for MarchingConfig {
     }
 }
 
-/// Training skips cells whose optical depth per step is below this (or below the mean).
+/// Training skips cells with an optical depth per step below this, or below the mean.
 const TRAINING_DEPTH: f32 = 0.01;
 /// Training steps in which all cells are updated.
 const WARM_UP: u64 = 256;
@@ -132,7 +132,7 @@ impl Marching {
         self.spacing(self.view_step())
     }
 
-    /// Steps that begin with this length. Those that are shorter than the first of training are so all along the ray.
+    /// Steps of an initial length. Steps shorter than training's stay so, in proportion, along the whole ray.
     fn spacing(&self, length: f32) -> Step {
         let cone = (self.config.cone as f32 * length / self.length(self.config.step)).min(1.0);
         Step { cone, ..Step::uniform(length) }
@@ -205,7 +205,7 @@ impl<T: Scalar> Sampler<T> for Marching {
         512
     }
 
-    /// Marks cells empty that no image shows, and carves the visual hull.
+    /// Marks cells empty that no camera sees, and carves the visual hull.
     fn prepare(&mut self, data: &Dataset) {
         if self.config.occupancy.skip.grid {
             visibility::carve_unseen(&mut self.grid, data);
@@ -221,7 +221,7 @@ impl<T: Scalar> Sampler<T> for Marching {
             return false;
         }
         let plan = if step < WARM_UP { Update::ALL } else { Update::PARTIAL };
-        // Updates are counted, not steps: so every cell has its turn.
+        // Counts updates instead of steps, so that every cell has its turn.
         self.grid.update(&plan, seed, step / GRID_EVERY, densities);
         let min_sigma = TRAINING_DEPTH / self.step();
         self.grid.threshold(&Threshold { min_sigma, or_mean: true, dilate: false });
@@ -283,7 +283,7 @@ mod tests {
     use raygrad_nn::Params;
     use std::sync::Mutex;
 
-    /// A ball that lies beyond the box is seen through the outer cascades, with even steps and with growing ones.
+    /// A ball beyond the box is visible in the outer cascades, with uniform and with growing steps.
     #[test]
     fn cascades_show_beyond_the_box_in_fewer_steps() {
         let scene = scenes().into_iter().find(|scene| scene.name == "sphere").unwrap();
@@ -315,7 +315,7 @@ mod tests {
     use glam::DVec3;
 
     #[test]
-    fn every_cell_has_its_turn_after_the_warm_up_too() {
+    fn updates_reach_every_cell_after_the_warm_up() {
         let occupancy = OccupancyConfig { resolution: 16, ..OccupancyConfig::default() };
         let grid = OccupancyGrid::new([DVec3::ZERO, DVec3::ONE], &occupancy).unwrap();
         let mut sampler: Box<dyn Sampler<f32>> =
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn space_unseen_by_images_is_left_out() {
+    fn unseen_space_is_skipped() {
         let mut data = ball(Split::Train, 16);
         data.frames.truncate(1);
         data.bounds = [DVec3::splat(-0.6), DVec3::splat(0.6)];
@@ -348,7 +348,7 @@ mod tests {
             Sampler::<f32>::prepare(&mut marching, data);
             marching.grid.occupied_share()
         };
-        // It sees the whole box; then a part of it, from nearby; and nothing is left out where nothing is to be.
+        // The camera sees the whole box; then, from nearby, a part of it. Without the grid nothing is skipped.
         assert_eq!(occupied(true, &data), 1.0);
         data.frames[0].camera.pose.translation *= 0.4;
         assert!((0.05..0.8).contains(&occupied(true, &data)), "{}", occupied(true, &data));
@@ -356,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_shrink_evenly_from_the_first_to_the_last() {
+    fn steps_shrink_geometrically_to_the_last() {
         let config = MarchingConfig { step: 0.01, last_step: Some(0.0025), ..MarchingConfig::default() };
         let grid = OccupancyGrid::new([DVec3::ZERO, DVec3::new(1.0, 4.0, 2.0)], &config.occupancy).unwrap();
         let mut marching = Marching::new(config, grid);

@@ -143,10 +143,10 @@ pub struct Proposal {
     trust: f64,
 }
 
-/// In disparity a ray begins at this share of its far end, if not later: at 0 disparity has no end.
+/// The least distance of a ray in disparity, as a share of its far end: disparity is infinite at 0.
 const NEAREST: f64 = 1e-3;
 
-/// The map between distances along a ray and shares that are even in the spacing.
+/// The map between distances along a ray and shares that are uniform in the spacing.
 struct Scale {
     ends: [f64; 2],
     disparity: bool,
@@ -210,7 +210,7 @@ impl Proposal {
         for (shares, weights) in shares.chunks_exact(old + 1).zip(weights.chunks_exact(old)) {
             let shift = jitter.draw();
             u.iter_mut().enumerate().for_each(|(i, u)| *u = (i as f64 + shift) / bins as f64);
-            // What made a weight bad shows in the colours.
+            // Bad weights count as 0 here; the colours show them.
             let temper = |weight: &T| match weight.to_f64() {
                 weight if weight.is_finite() && weight > 0.0 => weight.powf(self.trust),
                 _ => 0.0,
@@ -224,7 +224,7 @@ impl Proposal {
             out.extend(places.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])));
             out.push(1.0);
             if !whole && bins > 1 {
-                // As far beyond the outermost places as the next edges are before them.
+                // Symmetric around the outermost positions.
                 out[first] = (2.0 * places[0] - out[first + 1]).max(0.0);
                 out[first + bins] = (2.0 * places[bins - 1] - out[first + bins - 1]).min(1.0);
             }
@@ -241,7 +241,7 @@ impl<T: Scalar> Sampler<T> for Proposal {
         _: Purpose,
         jitter: &mut Jitter<'_>,
     ) -> Sampled<'t, T> {
-        // Proposals follow the field, and pull at nothing else.
+        // Proposals follow the field; no other gradient flows to them.
         let query = &Query { rays: None, ..*query };
         let mut shares: Vec<f64> = even_edges(self.config.levels[0].samples).repeat(rays.len());
         let (mut levels, mut asked) = (vec![], 0);
@@ -293,7 +293,7 @@ impl<T: Scalar> Sampler<T> for Proposal {
     }
 
     fn update(&mut self, progress: &Progress, _: &DensityFn<'_>) -> bool {
-        // Schlick's bias function with slope 10.
+        // Schlick's bias function with the slope 10.
         let x = (progress.step as f64 / self.config.anneal.max(1) as f64).min(1.0);
         self.trust = 10.0 * x / (9.0 * x + 1.0);
         false
@@ -327,7 +327,7 @@ mod tests {
         }
         let whole = sampler.resampled::<f64>(&shares, &weights, [10, 8], true, &mut Jitter::Middle);
         assert!(whole.chunks_exact(9).all(|edges| edges[0] == 0.0 && edges[8] == 1.0));
-        // Without any say of the weights, evenly.
+        // An exponent of 0 ignores the weights: the bins are uniform.
         let sampler = Proposal { trust: 0.0, ..sampler };
         let even = sampler.resampled::<f64>(&shares, &[0.25; 20], [10, 4], true, &mut Jitter::Middle);
         assert!(even.iter().zip([0.0, 0.25, 0.5, 0.75, 1.0].repeat(2)).all(|(a, b)| (a - b).abs() < 1e-12));
@@ -347,7 +347,7 @@ mod tests {
         }
         Sampler::<f64>::finish(&mut *sampler, &|_, _| {});
         assert_eq!(sampler.trust, 1.0);
-        // The spacing that is configured is that of the steps.
+        // The steps use the configured spacing.
         let params = raygrad_nn::Params::<f64>::new();
         let tape = raygrad_autograd::Tape::new();
         let bound = params.bind(&tape);
@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn spacings_reach_from_near_to_far() {
+    fn spacings_range_from_near_to_far() {
         for spacing in [Spacing::Linear, Spacing::Disparity] {
             let scale = Scale::new(spacing, [2.0, 10.0]);
             assert!((scale.distance(0.0) - 2.0).abs() < 1e-12 && (scale.distance(1.0) - 10.0).abs() < 1e-12);

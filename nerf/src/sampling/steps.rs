@@ -52,7 +52,7 @@ pub fn importance_sampling<T: Scalar>(
     Samples::new(rays, segments, t, delta, pool)
 }
 
-/// The length of the part of `[near, far]` that is closest to each of the rising distances `t`.
+/// Voronoi lengths: of the part of `[near, far]` that is closest to each of the rising distances `t`.
 fn voronoi<T: Scalar>(t: &[T], [near, far]: [T; 2], delta: &mut [T]) {
     let half = T::from_f64(0.5);
     let mut edge = near;
@@ -106,7 +106,7 @@ pub fn invert_cdf<T: Scalar>(
         }
         largest = largest.max(weight.to_f64());
     }
-    // In units of the largest, so that no sum overflows.
+    // Relative to the largest, so that no sum overflows.
     let weight = |i: usize| if largest > 0.0 { weights[i].to_f64() / largest } else { 0.0 };
     let (total, length): (f64, f64) = ((0..bins).map(weight).sum(), edges[bins] - edges[0]);
     let share = if total > 0.0 { uniform_share } else { 1.0 };
@@ -114,7 +114,7 @@ pub fn invert_cdf<T: Scalar>(
     let mass = |i: usize| share * width(i) + if share < 1.0 { (1.0 - share) * (weight(i) / total) } else { 0.0 };
     let (mut bin, mut below) = (0, 0.0);
     for (&u, out) in u.iter().zip(out) {
-        // The last bin takes what rounding leaves over, and bins without mass are passed.
+        // The last bin takes the rounding error, and bins without mass are skipped.
         while bin + 1 < bins && below + mass(bin) <= u {
             below += mass(bin);
             bin += 1;
@@ -190,7 +190,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn inversion_is_monotone_and_matches_the_histogram(
+        fn cdf_inversion_is_monotone_and_matches_histogram(
             weights in prop::collection::vec(0.0f32..1.0, 1..20), zeroed in 0usize..20
         ) {
             let mut weights = weights;

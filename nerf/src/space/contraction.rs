@@ -18,20 +18,20 @@ use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tensor
 #[derive(Debug, Clone, Copy)]
 pub struct Contraction;
 
-/// Radii are cut here.
+/// The largest radius; farther points move to it.
 const FARTHEST: f64 = 1e4;
 
 /// A point as a direction and a distance.
 struct Polar<T> {
-    /// `2 - 1/r` with the radius cut.
+    /// `2 - 1/r` with the limited radius.
     radius: T,
-    /// Slope of that along the ray.
+    /// Its derivative along the ray.
     along: T,
-    /// Slope across, `radius / r`.
+    /// Its derivative across, `radius / r`.
     across: T,
 }
 
-/// Writes the direction of `x` to `unit`. `None` for points that stay where they are.
+/// Writes the direction of `x` to `unit`. `None` for points inside of the ball, which do not move.
 fn polar<T: Scalar>(x: &[T], unit: &mut [T]) -> Option<Polar<T>> {
     let mut scale = T::ZERO;
     for &x in x {
@@ -45,13 +45,13 @@ fn polar<T: Scalar>(x: &[T], unit: &mut [T]) -> Option<Polar<T>> {
     let infinite = !scale.is_finite();
     let mut squares = 0.0;
     for (unit, &x) in unit.iter_mut().zip(x) {
-        // Towards infinity only the infinite elements count.
+        // For infinite points only the infinite coordinates count.
         *unit = if infinite { T::from_f64(if x.is_finite() { 0.0 } else { x.to_f64().signum() }) } else { x / scale };
         squares += unit.to_f64() * unit.to_f64();
     }
     let norm = squares.sqrt();
     let r = scale.to_f64() * norm;
-    // Not true for a row of zeros, whose direction is NaN.
+    // Written so that a row of zeros, whose direction is NaN, returns too.
     if !(r > 1.0) {
         return None;
     }
@@ -109,7 +109,7 @@ impl<T: Scalar> Op<T> for Contraction {
         let axis = x.shape().len() - 1;
         let mut column = Shape::from_slice(x.shape());
         let width = std::mem::replace(&mut column[axis], 1);
-        // The scale of a row, at least 1, cancels: so it is a constant.
+        // The scale of a row, at least 1, cancels, so it is a constant.
         let largest = |row: &[T]| T::from_f64(row.iter().fold(1.0, |most: f64, x| most.max(x.to_f64().abs())));
         let scales: Vec<T> = match width {
             0 => vec![T::ONE; column.iter().product()],
@@ -119,7 +119,7 @@ impl<T: Scalar> Op<T> for Contraction {
         let constant = |values: Vec<T>| x.tape().constant(Tensor::from_vec(&column, values));
         let (scale, least) = (constant(scales), constant(least));
         let unit = x / &scale;
-        // max(1, |x|) / scale, inside both branches: with it as radius the formula is the identity in the ball.
+        // max(1, |x|) / scale, inside both branches: as radius it makes the formula the identity in the ball.
         let norm = unit.square().sum_over(-1).reshape(&column).maximum(least).sqrt();
         let radius = (&norm * scale).minimum(FARTHEST);
         Some(unit * ((2.0 - radius.reciprocal()) / norm))

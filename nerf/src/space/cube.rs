@@ -29,8 +29,7 @@ fn one() -> f64 {
     1.0
 }
 
-/// The longest side of a box in its own units: so a new field hides as much of what is behind it whatever unit the
-/// scene is in.
+/// The longest side of a box in its own units. A new field is then equally opaque for any unit of the scene.
 const UNITS: f64 = 3.0;
 
 impl Space {
@@ -97,11 +96,11 @@ impl Space {
     }
 }
 
-/// Offsets from the eye of a picture, `[samples, 3]`, as places in it.
+/// Projects offsets from the eye, `[samples, 3]`, to normalised device coordinates.
 #[track_caller]
 fn project<'t, T: Scalar>(ndc: &Ndc, offsets: &Var<'t, T>) -> Var<'t, T> {
     let tape = offsets.tape();
-    // To halves of the picture's sides at the near plane, and depths in units of that.
+    // In halves of the frustum's sides at the near plane, with depth in units of the near plane.
     let across = ndc.slopes.map(|slope| 0.5 / (slope * ndc.near));
     let local = ndc.axes * DMat3::from_diagonal(DVec3::new(across[0], across[1], -1.0 / ndc.near));
     let local = local.transpose().to_cols_array().map(T::from_f64).to_vec();
@@ -116,7 +115,7 @@ mod tests {
     use raygrad_autograd::Tape;
 
     #[test]
-    fn pictures_become_cubes() {
+    fn ndc_maps_the_frustum_to_the_cube() {
         // From (1, 2, 3) along +y: right is x, up is z, back is -y.
         let axes = DMat3::from_cols(DVec3::X, DVec3::Z, DVec3::NEG_Y);
         let ndc = Ndc { eye: DVec3::new(1.0, 2.0, 3.0), axes, slopes: [0.5, 0.25], near: 2.0 };
@@ -124,7 +123,8 @@ mod tests {
         let space = Space { unbounded: true, ndc: Some(ndc), ..within };
         space.check().unwrap();
         let tape = Tape::<f64>::new();
-        // At the near plane and its left border; twice as far, at the border above; far away; before the near plane; behind.
+        // At the near plane and its left border; twice as far, at the upper border; far away; in front of the near
+        // plane; behind the eye.
         let points =
             [[1.0, 4.0, 3.0], [0.0, 4.0, 3.0], [1.0, 6.0, 4.0], [1.0, 2e9, 3.0], [1.5, 3.0, 3.0], [1.5, -9.0, 3.0]];
         let cube = space.cube(&tape.constant(Tensor::from(points)));
@@ -139,21 +139,21 @@ mod tests {
         for (got, expected) in cube.value().as_slice().iter().zip(expected.as_flattened()) {
             assert!((got - expected).abs() < 1e-12, "{:?}", cube.value());
         }
-        // Lines stay lines, and along them it is even in inverse depth.
+        // Lines stay lines, and inverse depth is uniform along them.
         let line = [1.0, 2.0, 4.0].map(|t| [1.0 + 0.1 * t, 2.0 + 4.0 * t, 3.0 + 0.3 - 0.2 * t]);
         let line = space.cube(&tape.constant(Tensor::from(line)));
         let [a, b, c] = [0, 1, 2].map(|i| DVec3::from_slice(&line.value().as_slice()[3 * i..]));
         assert!((b - a).cross(c - a).length() < 1e-12 && ((b - a).z / (c - b).z - 2.0).abs() < 1e-12, "{a} {b} {c}");
         let wrong = Space { ndc: Some(Ndc { near: 0.0, ..ndc }), ..space };
         assert!(wrong.check().unwrap_err().to_string().contains("`ndc`"));
-        // A scene within its box has no use for it.
+        // A bounded scene ignores it.
         let bounded = Space { unbounded: false, ..space };
         let point = tape.constant(Tensor::from([[0.2, 0.4, 0.6]]));
         assert_eq!(bounded.cube(&point).value(), within.cube(&point).value());
     }
 
     #[test]
-    fn boxes_become_cubes_and_space_a_ball() {
+    fn space_maps_to_the_cube_contracted_if_unbounded() {
         let bounds = [DVec3::new(-1.0, 0.0, 2.0), DVec3::new(3.0, 2.0, 4.0)];
         let tape = Tape::<f64>::new();
         let points = [[-1.0, 0.0, 2.0], [3.0, 2.0, 4.0], [1.0, 1.0, 3.0], [1.0, 1.0, 1e9], [1.0, 1.5, 3.0]];

@@ -6,14 +6,15 @@ use crate::dataset::{Dataset, Frame};
 use crate::space::occupancy::OccupancyGrid;
 use glam::{DAffine3, DVec3};
 
-/// Pixels around a place that must be transparent too: the footprint of the image's filter.
+/// The margin in pixels that must be transparent too: the footprint of the image's filter.
 const MARGIN: f64 = 1.5;
 
 /// The silhouette of one image.
 struct Silhouette<'a> {
     camera: &'a Camera,
     world_to_camera: DAffine3,
-    /// For each corner between pixels, row by row, how many pixels above it and to its left are not fully transparent.
+    /// For each corner between pixels, row-major, the number of pixels above it and to its left that are not fully
+    /// transparent.
     sums: Vec<u32>,
 }
 
@@ -37,7 +38,7 @@ impl<'a> Silhouette<'a> {
         Some(Silhouette { camera, world_to_camera: camera.pose.inverse(), sums })
     }
 
-    /// Whether a ball projects into the image entirely, onto fully transparent pixels only.
+    /// Returns true if the whole ball projects into the image, onto fully transparent pixels only.
     fn is_clear(&self, centre: DVec3, radius: f64) -> bool {
         let local = self.world_to_camera.transform_point3(centre);
         let depth = -local.z;
@@ -91,7 +92,7 @@ mod tests {
     use crate::dataset::{Image, Mask};
     use crate::space::occupancy::OccupancyConfig;
 
-    /// Looks along -z at a picture whose middle third is opaque.
+    /// A camera that looks along -z, with an image whose middle third is opaque.
     fn view(eye: DVec3, up: DVec3) -> Frame {
         let mut image = Image::new(60, 60, 4);
         for y in 20..40 {
@@ -104,10 +105,10 @@ mod tests {
     }
 
     #[test]
-    fn ball_is_carved_only_where_every_pixel_shows_it() {
+    fn carving_needs_every_pixel_transparent() {
         let frame = view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y);
         let silhouette = Silhouette::new(&frame).unwrap();
-        // At distance 10 the picture is 5.1 wide, a pixel .085.
+        // At the distance 10 the image is 5.1 wide, and a pixel 0.085.
         assert!(!silhouette.is_clear(DVec3::ZERO, 0.01), "in the middle");
         assert!(silhouette.is_clear(DVec3::new(1.7, 0.0, 0.0), 0.3));
         assert!(!silhouette.is_clear(DVec3::new(1.7, 0.0, 0.0), 0.9), "reaches into the silhouette");
@@ -121,19 +122,19 @@ mod tests {
         let opaque = Frame { image: Image::new(60, 60, 3).into(), ..frame.clone() };
         let bent = Frame { camera: Camera { lens: Lens::Fov { omega: 0.3 }, ..frame.camera.clone() }, ..frame.clone() };
         assert!(Silhouette::new(&opaque).is_none() && Silhouette::new(&bent).is_none());
-        // Where nothing is known of a pixel it may show something.
+        // Masked pixels are unknown, so they may be opaque.
         let masked = Frame { mask: Some(Mask::new(60, 60, |x, _| x < 40).into()), ..frame.clone() };
         assert!(!Silhouette::new(&masked).unwrap().is_clear(DVec3::new(1.7, 0.0, 0.0), 0.3));
     }
 
     #[test]
-    fn two_views_leave_the_box_that_both_see() {
+    fn carving_by_two_views_leaves_their_intersection() {
         let views = [view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y), view(DVec3::new(10.0, 0.0, 0.0), DVec3::Y)];
         let mut grid =
             OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &OccupancyConfig::default()).unwrap();
         let views: Vec<_> = views.iter().map(|frame| Silhouette::new(frame).unwrap()).collect();
         carve_views(&mut grid, &views, 1);
-        // A third of 5.1, seen in perspective, with two pixels and a cell of margin.
+        // A third of 5.1 in perspective, with a margin of two pixels and a cell.
         for axis in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]) {
             assert!(grid.is_occupied(0.85 * axis) && !grid.is_occupied(1.35 * axis), "{axis}");
         }
@@ -142,8 +143,8 @@ mod tests {
     }
 
     #[test]
-    fn one_wrong_mask_carves_nothing() {
-        // Sixteen cameras around the box, one of which has a picture that is transparent throughout.
+    fn carving_with_two_votes_ignores_a_wrong_mask() {
+        // Sixteen cameras around the box; the image of one is entirely transparent.
         let around = |i: usize| {
             let angle = i as f64 * std::f64::consts::TAU / 16.0;
             view(DVec3::new(10.0 * angle.cos(), 0.0, 10.0 * angle.sin()), DVec3::Y)

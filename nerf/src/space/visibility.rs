@@ -5,11 +5,11 @@ use crate::dataset::Dataset;
 use crate::space::occupancy::OccupancyGrid;
 use glam::DVec3;
 
-/// The cone around a camera's view.
+/// A cone around a camera's field of view.
 struct Cone {
     eye: DVec3,
     axis: DVec3,
-    /// Between the axis and the border, in radians.
+    /// The angle between the axis and the border, in radians.
     half_angle: f64,
 }
 
@@ -21,7 +21,7 @@ impl Cone {
         Cone { eye: camera.pose.translation, axis, half_angle }
     }
 
-    /// Whether a part of a ball may be visible farther away than `near`.
+    /// Returns true if a part of a ball may be visible beyond the distance `near`.
     fn sees(&self, centre: DVec3, radius: f64, near: f64) -> bool {
         let offset = centre - self.eye;
         let distance = offset.length();
@@ -47,7 +47,7 @@ mod tests {
     use crate::space::occupancy::OccupancyConfig;
 
     #[test]
-    fn what_one_camera_sees_stays_and_nothing_else() {
+    fn carve_unseen_keeps_the_visible_cone_alone() {
         let mut data = ball(Split::Train, 8);
         data.frames.truncate(1);
         let pose = Camera::look_at(DVec3::new(0.0, 0.0, 3.0), DVec3::ZERO, DVec3::Y);
@@ -58,15 +58,15 @@ mod tests {
         let whole = grid.occupied_share();
         carve_unseen(&mut grid, &data);
         let share = grid.occupied_share();
-        // A third of all cells are those of the inner box, which it sees nearly all of.
+        // The inner box has a third of all cells, and the camera sees nearly all of it.
         assert!(share > 0.35 && share < 0.5 * whole, "{share} of {whole}");
-        // It looks down from 3, sees nothing nearer than 1.5, and down to the floor of the outermost box.
+        // The camera looks down from 3, sees nothing nearer than 1.5, and sees the floor of the outermost box.
         let is_left = |x: f64, y: f64, z: f64| grid.is_occupied(DVec3::new(x, y, z));
         assert!(is_left(0.0, 0.0, 1.4) && !is_left(0.0, 0.0, 2.0) && is_left(0.0, 0.0, -3.99));
-        // tan .3 at the distance 7, 3 / 4 of that, and the corner of the image, with a cell around.
+        // tan 0.3 at the distance 7, 3/4 of that, and the corner of the image, with a cell around.
         assert!(is_left(2.1, 0.0, -3.99) && !is_left(3.4, 0.0, -3.99));
         assert!(is_left(0.0, 1.6, -3.99) && !is_left(0.0, 3.4, -3.99));
-        // Every place on a ray of the camera is still there: also those on its border.
+        // Every point on a ray of the camera stays, also on its border.
         let mut rays = crate::Rays::new();
         for pixel in [[0, 0], [39, 29], [39, 0], [20, 15]] {
             rays.push_pixel(&data.frames[0].camera, pixel, grid.outer_bounds(), [1.5, 6.0]);
@@ -78,7 +78,7 @@ mod tests {
             found.t.len()
         };
         assert_eq!(count(&grid), count(&OccupancyGrid::new(grid.bounds(), &config).unwrap()));
-        // A second camera that looks elsewhere takes nothing away.
+        // A second camera that looks elsewhere carves nothing.
         let mut other = data.frames[0].clone();
         other.camera.pose = Camera::look_at(DVec3::splat(-3.0), DVec3::new(-3.0, 3.0, -3.0), DVec3::Z);
         data.frames.push(other);

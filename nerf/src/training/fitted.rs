@@ -10,9 +10,9 @@ use raygrad_nn::Schedule;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Optimization steps, over all images together.
+/// Optimization steps, for all images together.
 const STEPS: u64 = 400;
-/// The learning-rate schedule of poses, in radians by which an image moves.
+/// The learning-rate schedule of poses, in radians of image motion.
 const RATE: Schedule = Schedule::Exponential { from: 2e-3, to: 2e-5, warmup: 0.0 };
 
 /// Refines the poses of images against a fixed model and returns their cameras.
@@ -32,7 +32,7 @@ pub fn fitted_cameras(model: &Model<f32>, photographs: Dataset) -> Result<Vec<Ca
         ..model.config.clone()
     };
     let photographs = Arc::new(photographs);
-    // No time is measured.
+    // The clock is not used.
     let mut trainer = Trainer::with_clock(config, photographs.clone(), model.scene_box, || Duration::ZERO)?;
     let params = &mut trainer.model.params;
     let ids: Vec<_> = params.ids().filter(|id| params.name(*id) != POSES).collect();
@@ -42,7 +42,7 @@ pub fn fitted_cameras(model: &Model<f32>, photographs: Dataset) -> Result<Vec<Ca
             return Err(Error::setting(name, "is missing in the model; use one that was built from its configuration"));
         };
         let shape = params.get(id).shape().to_vec();
-        // Parameters per training image become their mean for other images.
+        // For other images, parameters per training image become their mean.
         let value = if known.shape() == shape { known.clone() } else { mean_rows(known, &shape) };
         *params.get_mut(id) = value;
     }

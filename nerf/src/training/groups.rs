@@ -6,14 +6,16 @@ use crate::{Error, Result};
 use raygrad_autograd::Gradient;
 use raygrad_nn::{Adam, AdamConfig, Optimizer, OptimizerState, Params, Schedule, StateError, UpdateReport};
 
-/// Parameters of cameras, each with its own schedule.
+/// Parameters of cameras and exposure; each has its own schedule.
 const CAMERAS: [&str; 5] = [POSES, FOCAL, LENS, EXPOSURE, VIGNETTING];
 
-/// The optimizer of all parameters. A parameter belongs to the first configured group that matches its name; otherwise
-/// to that of its camera parameter, of the tables (updated by rows), or of the rest.
+/// The optimizer of all parameters.
+///
+/// A parameter belongs to the first configured group that matches its name. Otherwise it belongs to that of its camera
+/// parameter, of the tables (updated by rows), or of the rest.
 pub(crate) struct Groups {
     adam: Adam<f32>,
-    /// Of each group, as the optimiser numbers them.
+    /// The schedule of each group, by the optimizer's numbering.
     schedules: Vec<Schedule>,
 }
 
@@ -43,7 +45,7 @@ impl Groups {
         Ok(groups)
     }
 
-    /// Adds a group of the parameters that `which` chooses and no group has; returns their number.
+    /// Adds a group of the parameters that `which` selects and no other group has; returns their number.
     fn add(
         &mut self,
         params: &Params<f32>,
@@ -128,11 +130,11 @@ mod tests {
         let report = groups.update(&mut params, &grads, 0.0, 1.0);
         assert_eq!((report.moved, report.skipped, groups.steps()), (12, 0, 1));
         let moved: Vec<f32> = params.values().iter().map(|value| value.as_slice()[0]).collect();
-        // Adam's first step is the learning rate; what decays does so first.
+        // Adam's first step is the learning rate; weight decay comes first.
         for (found, expected) in moved.iter().zip([0.9, 1.0 * (1.0 - 0.2 * 0.5) - 0.2, 0.999, 1.0]) {
             assert!((found - expected).abs() < 1e-6, "{moved:?}");
         }
-        // Poses have a rate of their own, if they are learned.
+        // Poses have their own schedule if they are learned.
         for (poses, expected) in [(Some(Schedule::Constant { rate: 0.25 }), 0.75), (None, 0.9)] {
             let mut learned = Params::new();
             learned.add("poses", Tensor::full(&[1, 6], 1.0_f32));
@@ -142,15 +144,15 @@ mod tests {
             assert_eq!(report.moved, 6);
             assert!((learned.values()[0].as_slice()[0] - expected).abs() < 1e-6, "{:?}", learned.values());
         }
-        // The first group that fits counts; one that fits nothing is an error.
+        // The first matching group counts; one that matches nothing is an error.
         config.groups = vec![group("field.", 0.5, 0.0), group("field.color", 0.2, 0.0)];
         let error = Groups::new(&config, &params).err().unwrap().to_string();
         assert!(error.starts_with("`groups.field.color`") && error.contains("pose.3"), "{error}");
     }
 
     #[test]
-    fn tables_and_networks_have_their_own_constants() {
-        // With a beta1 of 0 the second step forgets the first gradient; with .9 it does not.
+    fn tables_and_networks_have_own_adam_constants() {
+        // With a beta1 of 0 the second step forgets the first gradient; with 0.9 it does not.
         let mut config = Config::preset(Preset::Instant);
         config.schedule = Schedule::Constant { rate: 0.1 };
         config.table_adam = AdamConfig { beta1: 0.0, ..AdamConfig::default() };

@@ -14,7 +14,7 @@ use raygrad_autograd::{Scalar, Var};
 use raygrad_nn::Bound;
 use std::ops::Add;
 
-/// Counts and results, summed over rays.
+/// Counts and errors, summed over rays.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Work {
     /// Samples placed on rays.
@@ -67,7 +67,7 @@ pub(crate) fn rays_loss<'t>(
     let VisibleSamples { rendered, density_queries: asked, visible: kept } =
         sampler.quadrature().render(&query, &steps, sampler.early_stop_eps());
     let gains = model.exposure.as_ref().map(|tone| tone.gains(params, batch));
-    // As the image has it: the background is not part of the scene.
+    // Gains apply to the scene, not to the background.
     let shown = |seen: &Rendered<'t, f32>| match &gains {
         Some(gains) => seen.over(&background) + &seen.color * (gains - 1.0),
         None => seen.over(&background),
@@ -76,7 +76,7 @@ pub(crate) fn rays_loss<'t>(
     let fine = model.config.loss.sum(&color, &target);
     let error = match model.config.loss {
         Loss::Mse => fine.item(),
-        // PSNR is made of squared errors whatever is minimised.
+        // PSNR needs squared errors, for any loss.
         _ => tape.no_grad(|| Loss::Mse.sum(&color, &target).item()),
     };
     let coarse = coarse.iter().map(|seen| model.config.loss.sum(&shown(seen), &target));

@@ -9,19 +9,18 @@ use crate::random::stream;
 use rand::RngExt;
 use raygrad_autograd::{Gradient, Tape, Tensor};
 
-/// Points at which a new field is probed.
+/// Points at which a new field is evaluated.
 const PROBES: usize = 512;
-/// Share of the points that must have a density gradient.
+/// The least share of points with a density gradient.
 const ALIVE: f64 = 0.01;
-/// Seeds to try before the last one is taken as it is.
+/// Seeds to try; the last one is accepted in any case.
 const ATTEMPTS: u32 = 32;
-/// Steps of a model after which its opacity is judged, and until which it may end a run.
+/// The steps of a model in which its opacity is checked for a collapse.
 const JUDGED: std::ops::Range<u64> = 100..1000;
-/// Collapses that end a run: a scene that is empty in truth must not restart for ever.
+/// The most restarts of a run: an empty scene must not restart for ever.
 const COLLAPSES: u32 = 3;
 
-/// The first of the models with seeds `seed`, `seed + 1`, .. whose fields have a gradient to learn from, and how many
-/// were passed over.
+/// The first model of the seeds `seed`, `seed + 1`, .. whose fields have a gradient, and the number of rejected ones.
 pub(crate) fn living_model(
     config: &Config,
     extent: SceneBox,
@@ -39,7 +38,7 @@ pub(crate) fn living_model(
     }
 }
 
-/// The share of random points in the box where the density has a slope; 1 if it has none anywhere but parameters have a
+/// The share of random points in the box with a density gradient. It is 1 if there are none but parameters have a
 /// gradient.
 fn alive_share(model: &Model<f32>, field: &dyn Field<f32>) -> f64 {
     let mut rng = stream(0, [0, 0]);
@@ -53,7 +52,7 @@ fn alive_share(model: &Model<f32>, field: &dyn Field<f32>) -> f64 {
     let slopes = density.grad(&[&positions]);
     let moved = slopes[0].as_slice().chunks_exact(3).filter(|slope| slope.iter().any(|x| *x != 0.0)).count();
     if moved == 0 {
-        // A field may be the same everywhere, or have no slopes, and yet learn.
+        // A field may be constant, or without slopes, and still learn.
         let learns = |grad: &Gradient<f32>| {
             !grad.is_dense() || grad.dense().is_some_and(|grad| grad.as_slice().iter().any(|x| *x != 0.0))
         };
@@ -63,8 +62,8 @@ fn alive_share(model: &Model<f32>, field: &dyn Field<f32>) -> f64 {
     moved as f64 / PROBES as f64
 }
 
-/// Whether a model in its first steps shows nothing at all: the collapse to an all-background image. `steps` is how
-/// many it has taken, and `collapses` how many models of the run have collapsed before it.
+/// Returns true if a model renders an empty image in its first steps: the collapse to the background. `steps` counts
+/// its steps, and `collapses` the earlier collapses of the run.
 pub(crate) fn has_collapsed(steps: u64, opacity: f64, collapses: u32) -> bool {
     JUDGED.contains(&steps) && opacity < 1e-3 && collapses < COLLAPSES
 }

@@ -12,13 +12,14 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
-/// The most rays that a step may have.
+/// The most rays per step.
 const MOST_RAYS: usize = 1 << 20;
-/// The name of the trainer's own numbers in the bytes.
+/// The name of the trainer's own numbers in the file.
 const TRAINER: &str = "trainer";
 
-/// A trainer's state beside model and optimizer. There is no random state: every random number is a function of the
-/// seed, the step and the tile.
+/// A trainer's state beside model and optimizer.
+///
+/// There is no random state: every random number is a function of the seed, the step and the tile.
 #[derive(Serialize, Deserialize)]
 struct Counts {
     config: Config,
@@ -34,7 +35,7 @@ struct Counts {
     /// The share of detail of the fields.
     #[serde(default = "one")]
     detail: f64,
-    /// Number of parts of the optimizer's state: one. Earlier versions had one per group of parameters.
+    /// The number of parts of the optimizer's state, which is one. Earlier versions had one per group.
     groups: usize,
     /// Settings of the parameters, in their order.
     settings: Vec<Setting>,
@@ -190,7 +191,7 @@ impl Model<f32> {
         Ok(model)
     }
 
-    /// The model of a state, the counts beside it, and the parts that were not used yet.
+    /// The model of a state, the counts, and the remaining parts.
     fn restored(&self, state: &[u8]) -> Result<(Self, Counts, HashMap<String, Vec<u8>>)> {
         let mut model = self.clone();
         let mut blobs = model.params.load_safetensors(state).map_err(failed)?;
@@ -229,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_come_back_before_the_first_step_too() {
+    fn state_round_trips_before_the_first_step() {
         let mut trainer = trainer();
         (trainer.collapses, trainer.done.restarts, trainer.batch) = (2, 3, 512);
         trainer.set_lr_scale(0.125);
@@ -243,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_is_seen_as_it_was() {
+    fn at_state_restores_parameters_and_detail() {
         let mut trainer = trainer();
         trainer.step(0.0);
         let state = trainer.state().unwrap();
@@ -259,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_no_run_has_are_refused() {
+    fn invalid_state_numbers_are_errors() {
         let mut trainer = trainer();
         let written = |change: &dyn Fn(&mut Counts)| {
             let params = &trainer.model.params;
@@ -283,7 +284,7 @@ mod tests {
             (written(&|counts| counts.detail = 1.5), "has a detail of 1.5; use 0 to 1"),
             (written(&|counts| counts.detail = -1.0), "has a detail of -1; use 0 to 1"),
         ];
-        // What does not move is a number that a run may have.
+        // Zeros are valid numbers of a run.
         let still = written(&|counts| {
             (counts.settings[0].rate, counts.settings[1].decay, counts.pace, counts.detail) = (0.0, 0.0, 0.0, 0.0);
         });
@@ -298,9 +299,9 @@ mod tests {
         trainer.load_state(&before).unwrap();
     }
 
-    /// Earlier versions had an optimiser for each group, and a state of each.
+    /// Earlier versions had an optimizer and a state per group.
     #[test]
-    fn states_in_parts_are_read() {
+    fn states_of_earlier_versions_are_read() {
         let mut trainer = trainer();
         trainer.step(0.0);
         let state = trainer.state().unwrap();

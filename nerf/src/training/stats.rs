@@ -4,7 +4,7 @@ use raygrad_nn::SLOTS;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::time::Duration;
 
-/// Consecutive steps without a finite gradient after which a run has diverged: a single overflow passes.
+/// Consecutive steps without a finite gradient after which a run has diverged. A single overflow may pass.
 pub(crate) const STUCK: u64 = 100;
 
 /// The length of a run, in steps or time.
@@ -20,9 +20,9 @@ pub enum Budget {
     Time(Duration),
 }
 
-/// Samples of a step of the instant preset.
+/// Samples per step of the instant preset.
 const SAMPLES_PER_STEP: f64 = 24576.0;
-/// Samples that it is trained with in a second by each core, about.
+/// Training samples per second and core, approximately.
 const SAMPLES_PER_SECOND: f64 = 1e6;
 
 impl Budget {
@@ -33,14 +33,14 @@ impl Budget {
         match self {
             Budget::Steps(steps) => steps as f64 * SAMPLES_PER_STEP,
             Budget::Time(time) => {
-                // A step is cut into as many parts as there are slots, and no more threads take part.
+                // A step has one part per slot, so more threads do not help.
                 time.as_secs_f64() * SAMPLES_PER_SECOND * rayon::current_num_threads().min(SLOTS) as f64
             }
         }
     }
 }
 
-/// A duration as a number of seconds.
+/// Serialises a duration as seconds.
 mod seconds {
     use serde::{Deserialize, Deserializer, Serializer, de::Error};
     use std::time::Duration;
@@ -100,7 +100,7 @@ pub struct StepStats {
     pub restarts: u32,
 }
 
-/// A number that files write as null if it is not finite.
+/// Reads a number; null, as files write non-finite ones, is NaN.
 fn number_or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN))
 }
@@ -147,7 +147,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn budgets_are_read_and_stand_for_samples() {
+    fn budgets_are_read_and_estimate_samples() {
         let read = |text: &str| serde_json::from_str::<Budget>(text);
         let threads = rayon::current_num_threads().min(8) as f64;
         for (text, budget, samples) in [
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn a_short_run_of_bad_numbers_ends_badly() {
+    fn short_run_of_non_finite_steps_diverges() {
         let at = |step, stuck| StepStats { step, non_finite_steps: stuck, ..StepStats::default() };
         assert!(!at(0, 0).ends_diverged() && !at(50, 20).ends_diverged() && !at(5000, 99).ends_diverged());
         assert!(at(50, 25).ends_diverged() && at(1, 1).ends_diverged() && at(5000, 100).ends_diverged());

@@ -19,9 +19,9 @@ use std::ops::{Add, ControlFlow};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Rays of a step that is to have a number of samples: the least, and the most.
+/// The least and the most rays per step, if a number of samples is configured.
 const RAYS: [usize; 2] = [256, 1 << 16];
-/// Steps between two trims of unused memory: the number of samples changes during training.
+/// Steps between releases of unused memory: the number of samples changes during training.
 const TRIM_EVERY: u64 = 256;
 
 /// Trains a model on a dataset: [`run`](Self::run) for a budget, or [`step`](Self::step) by step.
@@ -47,7 +47,7 @@ pub struct Trainer {
     pub(super) done: StepStats,
 }
 
-/// The rays of a step, which are drawn tile by tile.
+/// The rays of a step, drawn tile by tile.
 struct Draw<'a> {
     model: &'a Model<f32>,
     data: &'a Dataset,
@@ -145,10 +145,10 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// Lets the sampler learn from the images, within the training time.
+    /// Lets the sampler prepare from the images; the time counts as training.
     fn prepare(&mut self) {
         let start = (self.clock)();
-        // Not with cameras that are refined: carved space never comes back.
+        // Not with camera refinement: carved space never comes back.
         if self.model.camera_optimizer.is_none() {
             self.model.sampler.prepare(&self.data);
         }
@@ -183,9 +183,9 @@ impl Trainer {
             }
         }
         let start = (self.clock)();
-        // Frees the memory of the steps before the last update of the grid.
+        // Frees the memory of steps before the last grid update, which needs its own.
         (self.tiles, self.pool) = (Tiles::new(), Pool::new());
-        // A model of non-finite parameters has nothing to look at.
+        // A model with non-finite parameters cannot update the grid.
         if !self.done.has_diverged() {
             self.model.finish();
         }
@@ -199,7 +199,7 @@ impl Trainer {
         if self.model.config.camera_optimizer.coarse > 0.0 {
             self.model.set_detail(self.model.config.camera_optimizer.detail(fraction));
         }
-        // Of a model that began again, from its own beginning.
+        // After a restart, steps of the new model count.
         self.update_sampler(&Progress { step: self.groups.steps() + 1, train_frac: fraction, seed: self.seed() });
         let mut tiles = std::mem::take(&mut self.tiles);
         let draw = self.draw(fraction);
@@ -230,7 +230,7 @@ impl Trainer {
             occupied: self.done.occupied,
             lr: self.pace * self.model.config.schedule.lr(fraction),
             non_finite: self.done.non_finite + report.skipped as u64,
-            // A network may turn NaN into gradients of 0, with which parameters do move.
+            // A network may turn NaN into gradients of 0, which still move parameters.
             non_finite_steps: if report.has_only_non_finite() || !work.loss.is_finite() {
                 self.done.non_finite_steps + 1
             } else {
@@ -245,7 +245,7 @@ impl Trainer {
         self.done
     }
 
-    /// A restart draws other rays too.
+    /// The seed of the current model: a restart draws other rays too.
     fn seed(&self) -> u64 {
         self.model.config.seed.wrapping_add(u64::from(self.done.restarts) << 32)
     }
@@ -255,7 +255,7 @@ impl Trainer {
         let (number, total) = (self.done.step + 1, self.batch);
         let tile = match self.model.sampler.batch_size() {
             BatchSize::Rays { tile, .. } => tile,
-            // With more, smaller tiles, recording them would cost a two-core machine an eighth of its time.
+            // More, smaller tiles would cost a two-core machine an eighth of its time for recording.
             BatchSize::Samples(_) => total.div_ceil(SLOTS),
         };
         Draw { model: &self.model, data: &self.data, seed: self.seed(), number, fraction, total, tile }
@@ -305,7 +305,7 @@ impl Trainer {
         if let BatchSize::Samples(samples) = self.model.sampler.batch_size() {
             let each = (work.marched as f64 / self.batch as f64).max(0.5);
             let rays = samples as f64 / each;
-            // Not at once: the number of samples a ray is noisy.
+            // Averaged, since the number of samples per ray is noisy.
             let rays = (0.5 * (rays + self.batch as f64)).min(2.0 * self.batch as f64) as usize;
             self.batch = rays.next_multiple_of(SLOTS).clamp(RAYS[0], RAYS[1]);
         }
@@ -325,7 +325,7 @@ impl Trainer {
         self.collapses += 1;
         let Model { config, scene_box: extent, .. } = &self.model;
         if let Ok((mut model, _)) = startup::living_model(config, *extent, self.model.cameras(), self.seed()) {
-            // What was loaded and frozen is not thrown away, and rates are not forgotten.
+            // Loaded and frozen values, and lr scales, are kept.
             model.params.inherit(&self.model.params);
             self.model = model;
         }

@@ -97,7 +97,7 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
                 [x[0], &self.delta],
                 pool,
                 #[inline(always)]
-                // Not the product alone, which is NaN for 0 times infinity.
+                // A plain product would be NaN for 0 times infinity.
                 |[z, delta]| {
                     let sigma = (if z > most { most } else { z }).exp();
                     if sigma == T::ZERO { T::ZERO } else { sigma * delta }
@@ -108,7 +108,7 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
                 [x[0], &self.delta],
                 pool,
                 #[inline(always)]
-                // Not the product alone, which is NaN for 0 times infinity.
+                // A plain product would be NaN for 0 times infinity.
                 |[sigma, delta]| if sigma == T::ZERO { T::ZERO } else { sigma * delta },
             )
         }
@@ -126,7 +126,7 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
                 [g, cx.input(0), cx.output(), &self.delta],
                 cx.pool(),
                 #[inline(always)]
-                // An infinite depth blocks everything; NaN passes through.
+                // An infinite depth blocks everything, so its gradient is 0; NaN passes through.
                 |[g, z, x, delta]| {
                     let infinite = !delta.is_finite() || (x > T::ZERO && !x.is_finite());
                     if infinite || z > most { T::ZERO } else { g * x }
@@ -154,7 +154,7 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
             let values = pairs.map(|(&delta, &sigma)| f(delta, sigma)).collect();
             sigma.tape().constant(Tensor::from_vec(self.delta.shape(), values))
         };
-        // An infinite interval adds a constant: nothing to no density, and infinity to any.
+        // An infinite interval adds a constant: 0 without density, otherwise infinity.
         let finite = constant(&|delta, _| if delta.is_finite() { delta } else { T::ZERO });
         let infinite = constant(&|delta, sigma| if delta.is_finite() || sigma == T::ZERO { T::ZERO } else { delta });
         Some(sigma * finite + infinite)
@@ -198,7 +198,7 @@ mod tests {
         assert_eq!(depth(100.0, 1.0), (80.0_f32.exp(), 0.0), "beyond the end nothing changes");
         let (x, slope) = depth(f32::NAN, 1.0);
         assert!(x.is_nan() && slope.is_nan(), "a NaN passes through");
-        // What is recorded once more is the same function.
+        // A second recording is the same function.
         let tape = Tape::new();
         let z = tape.leaf(Tensor::from([100.0_f32, 2.0]));
         let x = tape.apply(OpticalDepth::of_log_density(Tensor::from([0.0, 0.5])), &[&z]);

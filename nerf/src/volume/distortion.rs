@@ -79,7 +79,7 @@ impl<T: Scalar> Op<T> for Distortion<T> {
         for (out, rows) in out.as_mut_slice().iter_mut().zip(self.segments.ranges()) {
             self.slopes(x[0].as_slice(), rows.clone(), &mut slopes);
             let products = x[0].as_slice()[rows].iter().zip(&slopes).map(|(w, slope)| w.to_f64() * slope);
-            // A quadratic form is half its gradient times its argument.
+            // A quadratic form is half the product of its gradient and its argument.
             *out = T::from_f64(0.5 * products.sum::<f64>());
         }
         out
@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "the midpoints of ray 1 must rise")]
-    fn midpoints_must_rise() {
+    fn distortion_of_falling_midpoints_panics() {
         Distortion::new(
             Tensor::from_vec(&[3], vec![0.9, 0.5, 0.4]),
             Tensor::<f32>::zeros(&[3]),
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn one_sample_has_only_its_own_length() {
+    fn distortion_of_one_sample_is_its_length() {
         let tape = Tape::<f64>::new();
         let op = Distortion::new(Tensor::full(&[1], 0.5), Tensor::full(&[1], 0.3), Segments::new([0, 1]));
         let w = tape.leaf(Tensor::full(&[1], 0.5));

@@ -17,8 +17,8 @@ pub struct VisibleSamples<'t, T: Scalar> {
     pub visible: usize,
 }
 
-/// Samples that each ray takes in the first round. Each further round takes twice as many: few rounds, and at most
-/// about as many samples in vain as there were needed.
+/// Samples per ray in the first round. Each further round takes twice as many. There are few rounds, and at most about
+/// as many unneeded samples as needed ones.
 const FIRST_ROUND: usize = 4;
 
 impl Quadrature {
@@ -63,7 +63,7 @@ impl Quadrature {
             }
         });
         let positions = query.positions(&samples);
-        // Rays that are variables may be other rays than those that were marched.
+        // Refined rays may differ from the marched ones.
         let same = |rays: &RayVars<'t, T>| {
             rays.origins.value() == &samples.origins && rays.directions.value() == &samples.directions
         };
@@ -80,16 +80,16 @@ impl Quadrature {
 /// The visible samples.
 struct Visible<T: Scalar> {
     samples: Samples<T>,
-    /// The outputs of kept operations for them.
+    /// Cached outputs of operations for them.
     memo: Memo<T>,
     /// Density queries.
     asked: usize,
 }
 
-/// The samples in front of which more than `early_stop_eps` of the light is left, found in rounds.
+/// The samples with more than `termination` of the light left in front, found in rounds.
 fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, termination: f64) -> Visible<T> {
     let (tape, mut rays) = (query.tape(), FrontToBack::new(samples, termination));
-    // Of what is found: the number of the sample, and its place among what was asked.
+    // For each found sample: its index, and its position among the queries.
     let (mut found, mut memos, mut sizes) = (Vec::<(u32, [u32; 2])>::new(), vec![], vec![]);
     while let (Some(round), memo) = tape.cache_outputs(|| rays.round(query, FIRST_ROUND << memos.len())) {
         let numbers = round.stretch.pieces.into_iter().flat_map(|(_, rows)| rows);
@@ -107,7 +107,7 @@ fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, terminatio
     Visible { samples: samples.select(&rows, tape.pool()), memo, asked: sizes.iter().sum() }
 }
 
-/// Rows of the memos of so many samples each; an empty memo if an output has other rows than samples.
+/// Gathers rows of the memos of `sizes` samples; an empty memo if an output has other rows than samples.
 fn gathered<T: Scalar>(memos: Vec<Memo<T>>, rows: &[[u32; 2]], sizes: &[usize], pool: &Pool<T>) -> Memo<T> {
     let fits = |(memo, size): (&Memo<T>, &usize)| memo.values().iter().all(|value| value.shape().first() == Some(size));
     match memos.iter().zip(sizes).all(fits) {

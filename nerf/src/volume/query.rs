@@ -110,7 +110,7 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
 
 /// The same values with scaled gradients.
 fn with_slopes<'t, T: Scalar>(x: Var<'t, T>, shares: &Tensor<T>) -> Var<'t, T> {
-    // What is added is 0.
+    // The added term is 0.
     let moved = (&x - x.detach()) * x.tape().constant(shares.clone());
     x.detach() + moved
 }
@@ -150,7 +150,7 @@ mod tests {
         params.add("much", Tensor::scalar(0.7));
         let mut rays = Rays::new();
         rays.push(&Ray { origin: DVec3::ZERO, direction: DVec3::Z }, [0.0, 4.0]);
-        // In the middles of four bins: at .5, 1.5, 2.5 and 3.5.
+        // At the middles of four bins: 0.5, 1.5, 2.5 and 3.5.
         let samples = stratified(&rays, 4, &mut Jitter::Middle, &Pool::new());
         assert_eq!(samples.t.as_slice(), [0.5, 1.5, 2.5, 3.5]);
         for (near, shares) in [(0.0, [1.0; 4]), (0.5, [1.0; 4]), (2.0, [1.0 / 16.0, 9.0 / 16.0, 1.0, 1.0])] {
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn by_every_way_to_a_picture_densities_learn_less() {
+    fn all_render_paths_scale_density_gradients() {
         let mut params = Params::<f64>::new();
         params.add("much", Tensor::scalar(0.7));
         let mut rays = Rays::new();
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_less_by_their_shares_and_values_stay() {
+    fn with_slopes_scales_gradients_alone() {
         let tape = Tape::<f64>::new();
         let x = tape.leaf(Tensor::from([[1.0, 2.0], [0.1, -1e300], [7.0, 0.0]]));
         let y = with_slopes(x.clone(), &Tensor::from_vec(&[3, 1], vec![0.25, 0.0, 1.0]));

@@ -127,7 +127,7 @@ impl<'t, T: Scalar> Rendered<'t, T> {
     /// If positions are not on the tape: see [`Query::slopes`](super::Query::slopes).
     #[track_caller]
     pub fn normals(&self) -> Var<'t, T> {
-        // The logarithm falls in the same direction, and does not overflow.
+        // The log density falls in the same direction and does not overflow.
         downhill(&self.density.value.sum().grad_graph(&[&self.positions]).remove(0))
     }
 
@@ -144,9 +144,9 @@ impl<'t, T: Scalar> Rendered<'t, T> {
     }
 }
 
-/// The unit vectors against slopes `[samples, 3]`, and 0 for none.
+/// The unit vectors against slopes `[samples, 3]`; 0 for no slope.
 fn downhill<'t, T: Scalar>(slopes: &Var<'t, T>) -> Var<'t, T> {
-    // In units of the largest, so that no square overflows.
+    // Relative to the largest, so that no square overflows.
     let largest = slopes.value().as_slice().chunks_exact(3);
     let least = T::from_f64(1e-30);
     let scales = largest.map(|x| x.iter().fold(least, |most, x| if x.abs() > most { x.abs() } else { most }));

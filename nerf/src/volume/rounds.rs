@@ -6,19 +6,19 @@ use crate::field::Density;
 use raygrad_autograd::{Pool, Scalar, Var};
 use std::ops::Range;
 
-/// Density queries of a round of views, about.
+/// Density queries per round of a render, approximately.
 const ROUND: usize = 4096;
-/// Samples that a ray takes in a round of views, at least: few while most rays end early.
+/// The fewest samples per ray and round of a render. It is small because most rays end early.
 const LEAST: usize = 8;
 
-/// Samples along rays, of which each round takes the next ones of the rays that still have light.
+/// Samples along rays, in rounds. Each round takes the next samples of the rays that still have light.
 pub(crate) struct FrontToBack<'a, T: Scalar> {
     samples: &'a Samples<T>,
     /// Optical depth of each ray so far.
     pub depths: Vec<f64>,
     /// The optical depth at which a ray ends.
     opaque: f64,
-    /// Samples that each ray has passed, if it has not ended.
+    /// Samples that each unfinished ray has passed.
     passed: usize,
 }
 
@@ -30,7 +30,7 @@ pub(crate) struct Stretch<T: Scalar> {
     pub pieces: Vec<(usize, Range<usize>)>,
 }
 
-/// A [`Stretch`], and what the field says of it.
+/// A [`Stretch`] and its densities.
 pub(crate) struct Round<'t, T: Scalar> {
     pub stretch: Stretch<T>,
     pub density: Density<'t, T>,
@@ -43,7 +43,7 @@ pub(crate) struct Round<'t, T: Scalar> {
 impl<'a, T: Scalar> FrontToBack<'a, T> {
     /// Follows rays until no more than `early_stop_eps` of their light is left.
     pub fn new(samples: &'a Samples<T>, termination: f64) -> Self {
-        // Without a termination rays end where f64 has no light left.
+        // Without termination, rays end where f64 has no light left.
         let opaque = -termination.max(5e-324).ln();
         FrontToBack { samples, depths: vec![0.0; samples.segments.len()], opaque, passed: 0 }
     }
@@ -103,7 +103,7 @@ mod tests {
     use raygrad_autograd::{Tape, Tensor};
     use raygrad_nn::{Bound, Params};
 
-    /// Nothing before x = 0, and a density of 1 behind.
+    /// No density before x = 0, and 1 behind.
     struct Wall;
 
     impl Field<f64> for Wall {
@@ -127,7 +127,7 @@ mod tests {
         let params = Params::new().bind(&tape);
         let query = Query::new(&Wall, &params);
         let all = stratified(&rays, 8, &mut Jitter::Middle, tape.pool());
-        // The second ray is cut to nothing.
+        // The second ray has no samples.
         let rows: Vec<u32> = (0..32).filter(|row| !(8..16).contains(row)).collect();
         let samples = all.select(&rows, tape.pool());
         let mut followed = FrontToBack::new(&samples, 0.02);
@@ -139,7 +139,7 @@ mod tests {
         let seen = |rays: &[(usize, usize)], third: [f64; 3], fourth: &[f64]| {
             (rays.to_vec(), [&vec![0.0; rays[0].1][..], &third[..rays[1].1], fourth].concat())
         };
-        // A depth of 3.912 leaves a fiftieth: the fourth ray ends within its second round.
+        // A depth of 3.912 leaves a fiftieth, so the fourth ray ends within its second round.
         let expected = [
             seen(&[(0, 3), (2, 3), (3, 3)], [0.0; 3], &[0.0, 1.0, 2.0]),
             seen(&[(0, 3), (2, 3), (3, 3)], [0.0, 1.0, 2.0], &[3.0, 4.0, 5.0]),

@@ -1,9 +1,9 @@
-//! Compositing as a whole: exact integrals, extremes, and digits behind opaque samples.
+//! Compositing as a whole: exact integrals, extremes, and precision behind opaque samples.
 
 use super::{OpticalDepth, accumulate, weights};
 use raygrad_autograd::{Scalar, Segments, Tape, Tensor, Var};
 
-/// Colour and light that is left, `[rays, channels]` and `[rays]`.
+/// Colour and remaining light, `[rays, channels]` and `[rays]`.
 fn composite<'t, T: Scalar>(
     op: OpticalDepth<T>,
     segments: &Segments,
@@ -13,7 +13,7 @@ fn composite<'t, T: Scalar>(
     [accumulate(&weights(&x, segments), features, segments), (-x.segment_sum(segments)).exp()]
 }
 
-/// Colour and light that is left of one ray, and the gradients of their sum by densities and colours.
+/// Colour and remaining light of one ray, and the gradients of their sum by densities and colours.
 fn one_ray<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64]) -> [Vec<f64>; 3] {
     let tensor = |x: &[f64], shape: &[usize]| Tensor::from_vec(shape, x.iter().map(|&x| T::from_f64(x)).collect());
     let n = sigma.len();
@@ -28,7 +28,7 @@ fn one_ray<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64]) -> [Vec<f64>
 }
 
 #[test]
-fn the_exponential_density_has_no_bad_gradient() {
+fn log_density_gradients_are_finite() {
     // One sample of colour 1: C = 1 - e^-x, dC/dz = x e^-x with x = e^z delta.
     for z in [-200.0, -20.0, 0.0, 15.0, 16.0, 88.0, 89.0, 200.0_f64] {
         for delta in [1e-6_f32, 1e-3, 1.0] {
@@ -48,7 +48,7 @@ fn the_exponential_density_has_no_bad_gradient() {
 }
 
 #[test]
-fn constant_medium_gives_the_exact_integral() {
+fn constant_medium_is_integrated_exactly() {
     // The rendering integrals, without the background: c (1 - E) and E.
     let n = 64;
     let [out, ..] = one_ray::<f64>(&vec![1.3; n], &vec![4.0 / n as f64; n], &vec![0.8; n]);
@@ -59,7 +59,7 @@ fn constant_medium_gives_the_exact_integral() {
 }
 
 #[test]
-fn no_samples_nothing_and_everything() {
+fn rays_without_samples_or_density_are_black() {
     let [out, ..] = one_ray::<f32>(&[], &[], &[]);
     assert_eq!(out, [0.0, 1.0], "no samples: the background");
     let [out, ..] = one_ray::<f32>(&[0.0; 3], &[1.0; 3], &[0.9; 3]);
@@ -72,7 +72,7 @@ fn no_samples_nothing_and_everything() {
 }
 
 #[test]
-fn tiny_optical_depths_keep_their_digits() {
+fn tiny_optical_depths_are_precise() {
     let n = 1024;
     let [out, ..] = one_ray::<f32>(&vec![1e-3; n], &vec![1.0 / n as f64; n], &vec![1.0; n]);
     let exact = -(-1e-3_f64).exp_m1();
@@ -80,7 +80,7 @@ fn tiny_optical_depths_keep_their_digits() {
 }
 
 #[test]
-fn the_gradient_survives_opaque_samples() {
+fn gradients_at_opaque_samples_are_exact() {
     // alpha = (.3, 1, .5), c = (.2, .9, .4): dC/dalpha = (-.7, .49 T, 0); dC/dx_i = (1 - alpha_i) dC/dalpha_i.
     let x = [-(0.7_f64.ln()), f64::INFINITY, 2.0_f64.ln()];
     let [out, d_sigma, d_colour] = one_ray::<f64>(&[x[0], 1e300, x[2]], &[1.0; 3], &[0.2, 0.9, 0.4]);

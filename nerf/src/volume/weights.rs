@@ -112,7 +112,7 @@ impl<T: Scalar> Op<T> for Weights {
             #[inline(always)]
             |[x]| -(-x).expm1(),
         );
-        // e^-x, not 1 - alpha, which has no digits behind an opaque sample.
+        // e^-x instead of 1 - alpha, which loses its digits behind an opaque sample.
         let passed = map(
             [x],
             pool,
@@ -123,11 +123,12 @@ impl<T: Scalar> Op<T> for Weights {
         let mut grad = pool.tensor(x.shape());
         let (g, out) = (cx.g().value().as_slice(), grad.as_mut_slice());
         for rows in self.segments.ranges() {
-            // In f64, so that the light from behind keeps its digits on rays of any number of samples.
+            // In f64, so that the light from behind is precise on rays of any number of samples.
             let mut behind = 0.0;
             for i in rows.rev() {
                 let (own, blocked) = (g[i].to_f64(), alpha[i].to_f64());
-                // What passes: of thin samples 1 - alpha has all digits and adds up with alpha, of thick ones e^-x has.
+                // The transmitted share: 1 - alpha is precise for thin samples and sums with alpha to 1; e^-x is
+                // precise for thick ones.
                 let passes = if blocked < 0.5 { 1.0 - blocked } else { passed[i].to_f64() };
                 out[i] = transmittance[i] * passed[i] * T::from_f64(own - behind);
                 behind = blocked * own + passes * behind;

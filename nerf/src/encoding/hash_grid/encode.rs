@@ -25,7 +25,7 @@ macro_rules! with_features {
 }
 
 impl HashGrid {
-    /// The features of `positions` (`[samples, 3]`, clamped to the unit cube) to `out` (`[samples, width]`).
+    /// Writes the features of `positions` (`[samples, 3]`, clamped to the unit cube) to `out` (`[samples, width]`).
     pub(super) fn encode<T: Scalar>(&self, positions: &[T], table: &[T], out: &mut [T]) {
         with_features!(self, encode_rows(positions, table, out))
     }
@@ -104,7 +104,8 @@ impl HashGrid {
         );
     }
 
-    /// Adds to `grad` (`[samples, 3]`) the gradient of `positions` that `d_out` (`[samples, width]`) makes.
+    /// Adds to `grad` (`[samples, 3]`) the gradient of `positions` for the output gradient `d_out` (`[samples,
+    /// width]`).
     pub(super) fn slopes<T: Scalar>(&self, positions: &[T], table: &[T], d_out: &[T], grad: &mut [T]) {
         with_features!(self, slope_rows(positions, table, d_out, grad))
     }
@@ -196,14 +197,14 @@ impl<T: Scalar> Op<T> for HashEncoding {
     }
 }
 
-/// The features of one level, `[samples, features]`, out of plain operations: only the choice of the cell is constant.
+/// The features of one level, `[samples, features]`, from plain operations. The choice of the cell alone is constant.
 fn reference_level<'t, T: Scalar>(level: &HashLevel, x: &Var<'t, T>, table: &Var<'t, T>) -> Var<'t, T> {
     let (tape, values) = (x.tape(), x.value());
     let column = |f: &dyn Fn(T) -> T, axis: usize| {
         tape.constant(Tensor::from_fn(&[values.shape()[0], 1], |i| f(values.as_slice()[3 * i + axis])))
     };
     let scale = f64::from(level.resolution);
-    // The conversion makes NaN 0.
+    // The conversion turns NaN into 0.
     let cell = |x: T| {
         let clamped = Real::minimum(Real::maximum(x, T::ZERO), T::ONE);
         ((clamped * T::from_f64(scale)).to_f64() as u32).min(level.resolution - 1)
@@ -224,7 +225,8 @@ fn reference_level<'t, T: Scalar>(level: &HashLevel, x: &Var<'t, T>, table: &Var
     (1..8).fold(corner(0), |sum, k| sum + corner(k))
 }
 
-/// The catalogue entries of this file: dense and hashed levels, with positions that no check moves across a border.
+/// The catalogue entries of this file: dense and hashed levels, with positions that stay within their cells in all
+/// checks.
 #[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let entry = |levels, features, log2_table, coarsest, finest| {

@@ -27,7 +27,7 @@ pub struct HashGridConfig {
 }
 
 impl HashGridConfig {
-    /// The largest `log2_table`: a grid of 512 cells along an axis then still has a row for each corner.
+    /// The largest `log2_table`: a grid of 512 cells per axis then has a row for every corner.
     pub(crate) const MOST_LOG2_TABLE: u32 = 28;
 
     /// Returns the paper's values: 16 levels of 2 features from 16 to 2048, tables of 2^19 rows.
@@ -76,10 +76,10 @@ pub struct HashLevel {
 }
 
 impl HashLevel {
-    /// Row, counted from the level's first, of the corner `[x, y, z]`; each coordinate is at most the resolution.
+    /// The row of the corner `[x, y, z]` within the level; each coordinate is at most the resolution.
     ///
-    /// Either `x + (N+1) (y + (N+1) z)`, or the paper's hash (equation 4):
-    /// `(x xor 2654435761 y xor 805459861 z) mod rows`, in 32 bits.
+    /// Either `x + (N+1) (y + (N+1) z)`, or the paper's hash (equation 4): `(x xor 2654435761 y xor 805459861 z) mod
+    /// rows`, in 32 bits.
     #[inline(always)]
     pub(super) fn row(&self, [x, y, z]: [u32; 3]) -> u32 {
         if self.hashed {
@@ -104,7 +104,7 @@ pub(super) const PRIMES: [u32; 2] = [2_654_435_761, 805_459_861];
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HashGrid {
     levels: Arc<[HashLevel]>,
-    /// Rows of the table, and features in each.
+    /// Rows of the table, and features per row.
     shape: [usize; 2],
 }
 
@@ -119,7 +119,7 @@ impl HashGrid {
         let most = 1_usize << config.log2_table;
         let mut first = 0;
         let level = |l: usize| {
-            // The tiny excess makes the last level the finest in spite of rounding.
+            // The tiny excess makes the last level the finest despite rounding.
             let resolution = config.coarsest as f64 * (l as f64 * growth).exp() * (1.0 + 1e-12);
             let corners = (resolution as usize + 1).pow(3);
             let count = corners.min(most).next_multiple_of(16);

@@ -10,7 +10,7 @@ use super::grid::{HashLevel, PRIMES};
 use raygrad_autograd::{RowAdder, Scalar};
 use raygrad_tensor::simd;
 
-/// Samples of a block.
+/// Samples per block.
 pub(super) const BLOCK: usize = 64;
 
 /// Up to [`BLOCK`] positions, axis by axis, clamped to the unit cube.
@@ -24,7 +24,7 @@ impl<T: Scalar> Points<T> {
         Points { axes: [[T::ZERO; BLOCK]; 3], len: 0 }
     }
 
-    /// Takes the `[len, 3]` positions in. NaN stays NaN.
+    /// Loads `[len, 3]` positions. NaN stays NaN.
     #[inline(always)]
     pub(super) fn load(&mut self, positions: &[T]) {
         self.len = (positions.len() / 3).min(BLOCK);
@@ -38,11 +38,11 @@ impl<T: Scalar> Points<T> {
     }
 }
 
-/// Where the samples of a block lie on one level.
+/// The cells of a block's samples on one level.
 pub(super) struct Cells<T> {
-    /// Rows of the corners, counted from the level's first. Bit `k` of the corner's number is its step along axis `k`.
+    /// Rows of the corners within the level. Bit `k` of a corner's number is its step along axis `k`.
     rows: [[u32; BLOCK]; 8],
-    /// Place within the cell along each axis, in 0..=1.
+    /// Position within the cell along each axis, in 0..=1.
     place: [[T; BLOCK]; 3],
     /// Trilinear weights of the corners.
     weights: [[T; BLOCK]; 8],
@@ -54,11 +54,12 @@ impl<T: Scalar> Cells<T> {
         Cells { rows: [[0; BLOCK]; 8], place: [[T::ZERO; BLOCK]; 3], weights: [[T::ZERO; BLOCK]; 8], len: 0 }
     }
 
-    /// Rows, places and weights for `points` on `level`. Every row is below the number of the level's rows, whatever
-    /// the points are; a NaN coordinate counts as cell 0 and makes the weights NaN.
+    /// Computes rows, positions and weights of `points` on `level`.
     ///
-    /// It is a function of its own, for all numbers of features: inlined where it is called, it was compiled thirty
-    /// times.
+    /// Every row is below the level's number of rows, for any points. A NaN coordinate counts as cell 0 and makes the
+    /// weights NaN.
+    ///
+    /// It is not inlined: with the numbers of features of its callers it was compiled thirty times.
     #[inline(never)]
     pub(super) fn locate(&mut self, level: &HashLevel, points: &Points<T>) {
         simd::dispatch(
@@ -78,12 +79,12 @@ impl<T: Scalar> Cells<T> {
         let scale = T::from_f64(f64::from(level.resolution));
         let last = level.resolution as i32 - 1;
         for i in 0..BLOCK {
-            // The low and the high side of the cell along each axis: what they add to a row, and their weight.
+            // For the low and the high side of the cell along each axis: the contribution to the row, and the weight.
             let mut step = [[0; 2]; 3];
             let mut weight = [[T::ZERO; 2]; 3];
             for axis in 0..3 {
                 let x = points.axes[axis][i] * scale;
-                // At least 0 because points are clamped; the conversion makes NaN 0.
+                // At least 0, because points are clamped and the conversion turns NaN into 0.
                 let cell = (x.to_f64() as i32).min(last);
                 let place = x - T::from_f64(f64::from(cell));
                 self.place[axis][i] = place;
@@ -102,7 +103,7 @@ impl<T: Scalar> Cells<T> {
         }
     }
 
-    /// Starts to load the rows of all corners into the cache; `table` is the level's.
+    /// Prefetches the rows of all corners; `table` is the level's.
     #[inline(always)]
     pub(super) fn prefetch<const F: usize>(&self, table: &[[T; F]]) {
         for i in 0..self.len {
@@ -112,15 +113,15 @@ impl<T: Scalar> Cells<T> {
         }
     }
 
-    /// Writes the interpolated features to column `column` of each row of `out`, `[len, width]`; `table` is the
+    /// Writes the interpolated features to column `column` of each row of `out` (`[len, width]`); `table` is the
     /// level's.
     #[inline(always)]
     pub(super) fn gather<const F: usize>(&self, table: &[[T; F]], out: &mut [T], width: usize, column: usize) {
         for (i, out) in out.chunks_exact_mut(width).enumerate().take(self.len) {
             let mut sum = [T::ZERO; F];
             for corner in 0..8 {
-                // SAFETY: `locate` keeps rows below the level's row count, which callers assert to be the table's;
-                // the test `rows_stay_in_bounds` walks the extremes.
+                // SAFETY: `locate` keeps rows below the level's row count, which callers assert to be the table's. The
+                // test `rows_stay_in_bounds` covers the extremes.
                 let row = unsafe { table.get_unchecked(self.rows[corner][i] as usize) };
                 let weight = self.weights[corner][i];
                 for f in 0..F {
@@ -132,7 +133,7 @@ impl<T: Scalar> Cells<T> {
     }
 
     /// The adjoint of [`gather`](Self::gather) in the table: adds each sample's gradient to the rows of its corners, in
-    /// the order of the samples. Samples whose gradient is zero touch nothing.
+    /// the order of the samples. Samples with a zero gradient change nothing.
     #[inline(always)]
     pub(super) fn scatter<const F: usize>(
         &self,
@@ -141,8 +142,8 @@ impl<T: Scalar> Cells<T> {
         column: usize,
         grad: &mut RowAdder<'_, T, F>,
     ) {
-        // Neighbouring samples of a ray often share a cell, above all on coarse levels: their gradients are added up
-        // beside each other before the table is touched.
+        // Neighbouring samples of a ray often share a cell, above all on coarse levels. Their gradients are summed
+        // before the table is accessed.
         let (mut sums, mut cell) = ([[T::ZERO; F]; 8], None);
         for (i, d_out) in d_out.chunks_exact(width).enumerate().take(self.len) {
             let mut g = [T::ZERO; F];
@@ -171,7 +172,7 @@ impl<T: Scalar> Cells<T> {
         }
     }
 
-    /// Whether the corners of two samples of the block have the same rows.
+    /// Returns true if the corners of two samples of the block have the same rows.
     #[inline(always)]
     fn same_rows(&self, a: usize, b: usize) -> bool {
         let mut same = true;
@@ -181,7 +182,7 @@ impl<T: Scalar> Cells<T> {
         same
     }
 
-    /// Adds the sums of sample `i`'s corners to their rows and empties them.
+    /// Adds the sums of sample `i`'s corners to their rows and resets them.
     #[inline(always)]
     fn flush<const F: usize>(&self, i: usize, sums: &mut [[T; F]; 8], grad: &mut RowAdder<'_, T, F>) {
         for corner in 0..8 {
@@ -190,7 +191,7 @@ impl<T: Scalar> Cells<T> {
         }
     }
 
-    /// Starts to load what adding to the rows of all corners reads first.
+    /// Prefetches the first reads of an addition to the rows of all corners.
     #[inline(always)]
     pub(super) fn prefetch_sums<const F: usize>(&self, grad: &RowAdder<'_, T, F>) {
         for i in 0..self.len {
@@ -200,8 +201,8 @@ impl<T: Scalar> Cells<T> {
         }
     }
 
-    /// The adjoint of [`gather`](Self::gather) in the positions: adds to each row of `grad`, `[len, 3]`, the level's
-    /// part of the gradient, as if no position were clamped. `scale` is the resolution.
+    /// The adjoint of [`gather`](Self::gather) in the positions: adds the level's part of the gradient to each row of
+    /// `grad`, `[len, 3]`. It ignores clamping. `scale` is the resolution.
     #[inline(always)]
     pub(super) fn slopes<const F: usize>(
         &self,

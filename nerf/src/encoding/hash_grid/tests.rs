@@ -1,4 +1,4 @@
-//! The hash grid against a plain oracle, at its borders, and as a linear map with an adjoint.
+//! The hash grid: comparison with a plain oracle, borders, and the adjoint.
 
 use super::*;
 use proptest::prelude::*;
@@ -22,7 +22,7 @@ fn units(count: usize, salt: u64) -> Vec<f64> {
     (0..count as u64).map(|i| 0.5 + 5e3 * table.init::<f64>(salt + 1000 * i).as_slice()[0]).collect()
 }
 
-/// The features at one position, written down as the paper says them, in f64.
+/// The features at one position by the paper's formulas, in f64.
 fn oracle(grid: &HashGrid, x: &[f64], table: &Tensor<f64>) -> Vec<f64> {
     let features = grid.features();
     let mut out = vec![];
@@ -54,12 +54,12 @@ fn oracle(grid: &HashGrid, x: &[f64], table: &Tensor<f64>) -> Vec<f64> {
 }
 
 #[test]
-fn every_grid_of_the_catalogue_is_valid() {
+fn catalogue_grids_are_valid() {
     assert_eq!(entries().len(), 4);
 }
 
 #[test]
-fn the_papers_grid_has_the_papers_levels() {
+fn paper_grid_has_the_papers_levels() {
     let paper = HashGrid::new(&HashGridConfig::paper()).unwrap();
     let resolutions: Vec<_> = paper.levels().iter().map(|level| level.resolution).collect();
     assert_eq!(resolutions, [16, 22, 30, 42, 58, 80, 111, 153, 212, 294, 406, 561, 776, 1072, 1482, 2048]);
@@ -86,7 +86,7 @@ fn hash_grid_size_follows_budget_and_resolution() {
 }
 
 #[test]
-fn settings_out_of_range_are_named() {
+fn hash_grid_settings_out_of_range_are_named() {
     let wrong = [
         (HashGridConfig { finest: 65537, ..HashGridConfig::paper() }, "`finest`"),
         (HashGridConfig { coarsest: 0, ..HashGridConfig::paper() }, "`coarsest`"),
@@ -114,7 +114,7 @@ fn hash_encoding_agrees_with_formula_at_any_width() {
                 for (j, expected) in oracle(&grid, x, &table).into_iter().enumerate() {
                     let k = i * grid.width() + j;
                     assert!((got[k] - expected).abs() <= 1e-18 + 1e-12 * expected.abs(), "{x:?}");
-                    // Rounding the position moves the place in the cell by at most 2^-24 * 40.
+                    // Rounding of the position changes the position in the cell by at most 2^-24 * 40.
                     assert!((single[k] - expected).abs() <= 2e-9, "{x:?}");
                 }
             }
@@ -132,7 +132,7 @@ fn extremes(n: u32) -> Vec<f64> {
 
 #[test]
 fn rows_stay_in_bounds() {
-    // Bounds are asserted here, since the kernels do not check them: with rows that are all 1, whatever is read is 1.
+    // The kernels do not check bounds, so the test does. With a table of ones, every read must return 1.
     for n in [16, 17, 1000, 2048, 65535, 65536] {
         for (log2_table, levels) in [(4, 1), (15, 1), (15, 2)] {
             let grid = grid(levels, 2, log2_table, n as usize, n as usize);
@@ -161,7 +161,7 @@ fn rows_stay_in_bounds() {
 }
 
 #[test]
-fn values_are_continuous_across_cell_borders() {
+fn hash_encoding_is_continuous_across_cell_borders() {
     for n in [16_u32, 100, 2048, 65536] {
         let grid = grid(1, 2, 12, n as usize, n as usize);
         let table = grid.init::<f32>(3);
@@ -169,7 +169,7 @@ fn values_are_continuous_across_cell_borders() {
             let border = cell as f32 / n as f32;
             let at = |x: f32| encode(&grid, &[x.into(), 0.3, 0.7], &table);
             let (below, above) = (at(border.next_down()), at(border.next_up()));
-            // Features differ by at most 2e-4 over a cell, and two steps of f32 are this share of one.
+            // Features vary by at most 2e-4 across a cell, and two f32 steps are this share of a cell.
             let share = f64::from(border.next_up() - border.next_down()) * f64::from(n);
             for (a, b) in below.iter().zip(above) {
                 assert!((a - b).abs() <= 2e-4 * share + 1e-10, "{a} {b} at {border} of {n}");
@@ -192,7 +192,7 @@ fn hash_encoding_outside_the_cube_has_no_gradient() {
 
 proptest! {
     #[test]
-    fn scatter_is_the_adjoint_of_encode(seed in 0_u64..1000, samples in 1_usize..150) {
+    fn hash_scatter_is_the_adjoint_of_encode(seed in 0_u64..1000, samples in 1_usize..150) {
         let grid = grid(4, 2, 8, 3, 33);
         let (table, positions) = (grid.init::<f64>(seed), units(3 * samples, seed));
         let d_out = units(samples * grid.width(), seed + 1);
@@ -212,7 +212,7 @@ proptest! {
 }
 
 #[test]
-fn a_gradient_of_zero_touches_no_row() {
+fn zero_gradient_updates_no_row() {
     let grid = grid(2, 4, 9, 5, 50);
     let positions = units(3 * 20, 5);
     let mut d_out = units(20 * grid.width(), 6);
@@ -241,7 +241,7 @@ fn tiles(grid: &HashGrid, count: usize) -> Vec<Arc<HashGrad<f32>>> {
         .collect()
 }
 
-/// A store that holds a grid's table as it is at the start, and its gradient on these tiles.
+/// A store with a grid's initial table, and its gradient from these tiles.
 fn store(grid: &HashGrid, tiles: &[Arc<HashGrad<f32>>]) -> (Params<f32>, Gradient<f32>) {
     let mut params = Params::new();
     params.add("table", grid.init::<f32>(1));
@@ -269,7 +269,7 @@ fn hash_table_any_threads_give_same_bits() {
 }
 
 #[test]
-fn hash_table_moves_by_level_as_dense_gradient() {
+fn sparse_hash_update_equals_dense_update() {
     let grid = grid(3, 2, 6, 4, 16);
     let tiles = tiles(&grid, 2);
     let start = grid.init::<f32>(1);
@@ -289,7 +289,7 @@ fn hash_table_moves_by_level_as_dense_gradient() {
         let expected = if *g == 0.0 { 0.0 } else { -1e-2 * g.signum() };
         assert!((after - before - expected).abs() <= 1e-5, "{before} to {after}, gradient {g}");
     }
-    // The same from the sums of all rows at once, and from a dense gradient: of one tile, which is added up in one way.
+    // The row sums and the dense gradient of one tile have the same order of additions, so the updates must be equal.
     let (mut params, gradient) = store(&grid, &tiles[..1]);
     let report = Adam::new(AdamConfig::default()).update(&mut params, &[gradient], 1e-2);
     let mut sums = RowSums::new(grid.rows(), 2);
@@ -304,7 +304,7 @@ fn hash_table_moves_by_level_as_dense_gradient() {
 }
 
 #[test]
-fn a_nan_gradient_is_skipped_and_forgotten() {
+fn nan_gradient_is_skipped_and_forgotten() {
     let grid = grid(2, 2, 6, 4, 16);
     let mut tiles = tiles(&grid, 1);
     let (mut params, _) = store(&grid, &tiles);

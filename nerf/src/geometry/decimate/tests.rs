@@ -1,4 +1,4 @@
-//! Meshes that become coarser and stay what they are.
+//! Decimated meshes keep their shape and topology.
 
 use super::super::isosurface::{Lattice, isosurface};
 use super::super::mesh::tests::tetrahedron;
@@ -26,14 +26,14 @@ fn cuboid(x: DVec3) -> f64 {
 }
 
 #[test]
-fn fewer_triangles_hold_the_same() {
+fn decimation_keeps_shape_and_topology() {
     for (name, f) in [("ball", ball as fn(DVec3) -> f64), ("torus", torus), ("cuboid", cuboid)] {
         let fine = of(f, true);
         let mut coarse = fine.clone();
         let mut reports = vec![0.0];
         coarse.decimate(1000, &mut |done| reports.push(done));
         assert!(reports.is_sorted() && *reports.last().unwrap() <= 1.0, "{reports:?}");
-        // One at each ten thousand triangles that are left.
+        // One report per ten thousand triangles.
         assert_eq!(reports.len() - 1, fine.triangles.len() / OFTEN, "{name}");
         assert!(fine.triangles.len() > 3000, "{name}");
         assert!((999..=1000).contains(&coarse.triangles.len()), "{name}: {}", coarse.triangles.len());
@@ -42,10 +42,10 @@ fn fewer_triangles_hold_the_same() {
         assert_eq!(euler(&coarse), euler(&fine), "{name}");
         assert!((coarse.volume() / fine.volume() - 1.0).abs() < 0.01, "{name}: {} {}", coarse.volume(), fine.volume());
         assert!((coarse.area() / fine.area() - 1.0).abs() < 0.01, "{name}: {} {}", coarse.area(), fine.area());
-        // Vertices stay on the surface, by far less than the edges are long (about .1).
+        // Vertices stay near the surface, compared with an edge length of about 0.1.
         let off = coarse.positions.iter().map(|x| (f(*x) - 1.0).abs()).fold(0.0, raygrad_tensor::Real::maximum);
         assert!(off < 0.012, "{name}: {off}");
-        // No triangle has turned over: of the ball, all face away from the middle, and most do so squarely.
+        // No triangle flips: on the ball all face away from the centre, and most do so precisely.
         if name == "ball" {
             let faces_out = |i: usize| {
                 let [a, b, c] = coarse.corners(i);
@@ -63,8 +63,8 @@ fn fewer_triangles_hold_the_same() {
 }
 
 #[test]
-fn flat_sides_take_few_triangles_and_keep_their_edges() {
-    // Cells cut the edges off, but for a part of a cell.
+fn decimation_keeps_edges_of_flat_sides() {
+    // The lattice cuts the cuboid's edges off by a part of a cell.
     let mut mesh = of(cuboid, true);
     let before = mesh.volume();
     mesh.decimate(150, &mut |_| ());
@@ -76,7 +76,7 @@ fn flat_sides_take_few_triangles_and_keep_their_edges() {
 }
 
 #[test]
-fn a_mesh_that_cannot_be_coarser_stays_closed() {
+fn decimation_to_the_limit_stays_closed() {
     for f in [ball as fn(DVec3) -> f64, torus] {
         let mut mesh = of(f, true);
         let euler = mesh.positions.len() as i64 - mesh.triangles.len() as i64 / 2;
@@ -90,8 +90,8 @@ fn a_mesh_that_cannot_be_coarser_stays_closed() {
 }
 
 #[test]
-fn borders_stay_where_they_are() {
-    // A wave from border to border of the box: one sheet whose border is a rectangle.
+fn decimation_keeps_borders() {
+    // A wave that reaches the sides of the box: a single sheet with a rectangular border.
     let mut mesh = of(|x| 1.0 + 0.1 * (4.0 * x.x).sin() - x.z, false);
     let before = mesh.clone();
     mesh.decimate(400, &mut |_| ());
@@ -99,7 +99,7 @@ fn borders_stay_where_they_are() {
     assert!((mesh.area() / before.area() - 1.0).abs() < 0.01, "{} {}", mesh.area(), before.area());
     let ([low, high], [old_low, old_high]) = (mesh.bounds().unwrap(), before.bounds().unwrap());
     assert!(low.abs_diff_eq(old_low, 0.01) && high.abs_diff_eq(old_high, 0.01), "{low} {high}");
-    // Seen from above it still is the whole rectangle.
+    // The projection along z still covers the whole rectangle.
     let seen: f64 = (0..mesh.triangles.len())
         .map(|i| {
             let [a, b, c] = mesh.corners(i);
@@ -110,8 +110,8 @@ fn borders_stay_where_they_are() {
 }
 
 #[test]
-fn a_ribbon_is_not_tied_off() {
-    // A row of squares, each of two triangles: all sides across it lead from border to border.
+fn decimation_does_not_pinch_a_ribbon() {
+    // A row of squares of two triangles each: all edges across it connect the borders.
     let squares = 30;
     let positions = (0..2 * (squares + 1)).map(|i| DVec3::new(f64::from(i / 2), f64::from(i % 2), 0.0)).collect();
     let square = |i: u32| [[2 * i, 2 * i + 2, 2 * i + 1], [2 * i + 1, 2 * i + 2, 2 * i + 3]];

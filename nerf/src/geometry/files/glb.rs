@@ -6,8 +6,7 @@ use glam::DVec3;
 use raygrad_autograd::Formula;
 use serde_json::{Value, json};
 
-/// Numbers of the specification: component types, targets of buffer views, modes of primitives, and the kinds of
-/// chunks.
+/// Numbers of the specification: component types, buffer view targets, primitive modes and chunk types.
 const UNSIGNED_SHORT: u32 = 5123;
 const UNSIGNED_INT: u32 = 5125;
 const FLOAT: u32 = 5126;
@@ -18,7 +17,7 @@ const TRIANGLES: u32 = 4;
 const JSON: &[u8; 4] = b"JSON";
 const BIN: &[u8; 4] = b"BIN\0";
 
-/// The file, or what is wrong.
+/// The contents of the file, or an error message.
 pub(super) fn to_bytes(shape: &ColoredMesh, generator: &str) -> Result<Vec<u8>, String> {
     let ColoredMesh { mesh, normals, colors } = shape;
     let [low, high] = mesh.bounds().ok_or("needs at least one vertex in glTF")?;
@@ -33,7 +32,8 @@ pub(super) fn to_bytes(shape: &ColoredMesh, generator: &str) -> Result<Vec<u8>, 
     let position = buffer.add(places.iter().flatten().flat_map(|x| x.to_le_bytes()), ARRAY_BUFFER);
     let normal = normals.iter().flat_map(|normal| normal.as_vec3().to_array()).flat_map(f32::to_le_bytes);
     let normal = buffer.add(normal, ARRAY_BUFFER);
-    // Sixteen bits, as eight of light would not tell dark colours apart; the fourth number keeps vertices at multiples of 4 bytes.
+    // Sixteen bits, since eight bits of linear light would merge dark colours. The fourth number aligns vertices to 4
+    // bytes.
     let light = |byte: u8| (SrgbDecode.f([f64::from(byte) / 255.0]) * f64::from(u16::MAX)).round() as u16;
     let color = colors.iter().flat_map(|&[r, g, b]| [light(r), light(g), light(b), u16::MAX]);
     let color = buffer.add(color.flat_map(u16::to_le_bytes), ARRAY_BUFFER);
@@ -83,7 +83,7 @@ pub(super) fn to_bytes(shape: &ColoredMesh, generator: &str) -> Result<Vec<u8>, 
     Ok(out)
 }
 
-/// The buffer, and its parts.
+/// The buffer and its views.
 #[derive(Default)]
 struct Buffer {
     bytes: Vec<u8>,
@@ -91,7 +91,7 @@ struct Buffer {
 }
 
 impl Buffer {
-    /// Adds a part, of a multiple of 4 bytes as all numbers here are, and gives its number.
+    /// Adds a view, whose size is a multiple of 4 bytes, and returns its index.
     fn add(&mut self, numbers: impl Iterator<Item = u8>, target: u32) -> usize {
         let offset = self.bytes.len();
         self.bytes.extend(numbers);

@@ -3,13 +3,13 @@
 use super::super::colored_mesh::ColoredMesh;
 use std::fmt::Write;
 
-/// Digits of places, counted from the first of the largest.
+/// Significant digits of positions, relative to the largest.
 const DIGITS: i32 = 8;
 
 pub(super) fn to_text(shape: &ColoredMesh, comment: &str) -> String {
     let ColoredMesh { mesh, normals, colors } = shape;
     let largest = mesh.bounds().map_or(1.0, |[low, high]| (high - low).max_element());
-    // One point has no extent.
+    // A single point has no extent.
     let largest = if largest > 0.0 { largest } else { 1.0 };
     let decimals = (DIGITS - largest.log10().ceil() as i32).clamp(0, 17) as usize;
     let mut out = format!("# x y z red green blue, colours in sRGB\n# {comment}\n");

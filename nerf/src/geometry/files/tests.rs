@@ -1,4 +1,4 @@
-//! Files as other libraries read them.
+//! Written files, read back by other libraries.
 
 use super::super::mesh::Mesh;
 use super::*;
@@ -9,7 +9,7 @@ use ply_rs_bw::ply::{DefaultElement, Property};
 use raygrad_autograd::Formula;
 use std::f64::consts::FRAC_PI_2;
 
-/// Four vertices and three triangles, far away from the origin, no two numbers alike.
+/// Four vertices and three triangles far from the origin; all numbers differ.
 fn shape() -> ColoredMesh {
     let at = DVec3::new(500_000.25, -37.5, 12.0);
     let positions = [[0.0, 0.125, 0.25], [1.5, 0.375, 0.5], [0.625, 2.0, 0.75], [0.875, 1.0, 3.25]];
@@ -25,7 +25,7 @@ fn points() -> ColoredMesh {
     shape
 }
 
-/// The bytes of a file.
+/// The bytes of a written file.
 fn written(shape: &ColoredMesh, name: &str) -> Vec<u8> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
@@ -76,7 +76,7 @@ fn ply_files_are_read_by_another_library() {
 
 #[test]
 fn obj_files_are_read_by_another_library() {
-    // In f32 it would not have the digits of what is far away.
+    // The reader uses f32, which has too few digits far from the origin.
     let near = |mut shape: ColoredMesh| {
         shape.mesh.positions.iter_mut().for_each(|x| *x -= DVec3::new(500_000.0, 0.0, 0.0));
         shape
@@ -97,7 +97,7 @@ fn obj_files_are_read_by_another_library() {
     assert!(close(&mesh.normals, flat(&shape.normals), 1e-5));
     let colors = shape.colors.as_flattened().iter().map(|&byte| f64::from(byte) / 255.0).collect();
     assert!(close(&mesh.vertex_color, colors, 5.1e-5));
-    // Points have no faces, which that library makes no model of.
+    // Points have no faces, and the reader returns no model without faces.
     let text = String::from_utf8(written(&points(), "a.obj")).unwrap();
     let places: Vec<Vec<f64>> = text
         .lines()
@@ -126,10 +126,10 @@ fn glb_files_are_read_by_another_library() {
         let places: Vec<[f32; 3]> = reader.read_positions().unwrap().collect();
         assert_eq!(places.len(), 4);
         for (found, place) in places.iter().zip(&shape.mesh.positions) {
-            // The offset is a float to that library, and would keep its digits in one that reads doubles.
+            // The reader returns the offset as a float; readers of doubles would keep its digits.
             assert!((offset + DVec3::from(found.map(f64::from))).abs_diff_eq(*place, 0.04), "{found:?} {place}");
         }
-        // Among each other they are as they were.
+        // Relative positions are precise.
         let difference =
             |a: usize, b: usize| DVec3::from(places[a].map(f64::from)) - DVec3::from(places[b].map(f64::from));
         assert!(difference(3, 0).abs_diff_eq(shape.mesh.positions[3] - shape.mesh.positions[0], 1e-6));
@@ -144,7 +144,7 @@ fn glb_files_are_read_by_another_library() {
         assert_eq!((Some(bounds.min), Some(bounds.max)), (extremes(f32::min), extremes(f32::max)));
         let normals: Vec<[f32; 3]> = reader.read_normals().unwrap().collect();
         assert_eq!(normals, shape.normals.iter().map(|normal| normal.as_vec3().to_array()).collect::<Vec<_>>());
-        // Colours are light.
+        // Colours are linear light.
         let colors: Vec<[f32; 4]> = reader.read_colors(0).unwrap().into_rgba_f32().collect();
         for (found, bytes) in colors.iter().zip(&shape.colors) {
             let light = bytes.map(|byte| SrgbDecode.f([f64::from(byte) / 255.0]));
@@ -167,8 +167,8 @@ fn glb_files_are_read_by_another_library() {
 }
 
 #[test]
-fn shapes_go_back_to_the_coordinates_of_the_capture() {
-    // A quarter turn about z: x of the capture is y of the scene; half a scene unit is a unit of the capture.
+fn shapes_are_written_in_capture_coordinates() {
+    // A quarter turn about z maps x of the capture to y of the scene. Half a scene unit is a unit of the capture.
     let placement = SceneTransform {
         rotation: DMat3::from_quat(DQuat::from_rotation_z(FRAC_PI_2)),
         scale: 0.5,
@@ -184,9 +184,9 @@ fn shapes_go_back_to_the_coordinates_of_the_capture() {
 }
 
 #[test]
-fn comments_stay_in_their_line() {
+fn comments_stay_on_one_line() {
     let folder = tempfile::tempdir().unwrap();
-    // What ends a line in one of the formats or another, and would add to the header or the shape.
+    // Line ends and terminators of the formats, which could add to the header or the shape.
     let comment = "by me\nend_header\rv 1 2 3\r\n\0\u{85}\"}\\";
     for name in ["a.ply", "a.obj", "a.glb"] {
         let [plain, path] = ["plain-", ""].map(|before| folder.path().join(format!("{before}{name}")));
@@ -198,7 +198,7 @@ fn comments_stay_in_their_line() {
         write_with_comment(&shape(), &plain, "by me").unwrap();
         let plain = std::fs::read(&plain).unwrap();
         let lines = |bytes: &[u8]| bytes.iter().filter(|byte| [b'\n', b'\r', 0].contains(byte)).count();
-        // Padding of the binary format aside.
+        // The binary format pads its chunks.
         if name != "a.glb" {
             assert_eq!(lines(&bytes), lines(&plain), "{name}");
         }
@@ -209,7 +209,7 @@ fn comments_stay_in_their_line() {
 }
 
 #[test]
-fn other_endings_are_refused() {
+fn unknown_extension_is_an_error() {
     for name in ["a.stl", "ply", "a", "a.glb.txt"] {
         let message = write(&shape(), name).unwrap_err().to_string();
         assert!(message.contains("has an unknown extension; use .ply, .obj or .glb"), "{message}");

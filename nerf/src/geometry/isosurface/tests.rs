@@ -1,11 +1,11 @@
-//! Surfaces that are known exactly, and of what nobody would call one.
+//! Isosurfaces of functions with a known surface, and of random and extreme values.
 
 use super::*;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use std::f64::consts::PI;
 
-/// A function of positions as densities.
+/// Turns a function of positions into a density function.
 fn of(f: impl Fn(DVec3) -> f64 + Sync) -> impl Fn(&[[f32; 3]], &mut [f32]) + Sync {
     move |points, out| {
         for (point, out) in points.iter().zip(out) {
@@ -14,7 +14,7 @@ fn of(f: impl Fn(DVec3) -> f64 + Sync) -> impl Fn(&[[f32; 3]], &mut [f32]) + Syn
     }
 }
 
-/// The surface where `f` is more than `level` within the box, and 0 outside of it.
+/// The closed or open surface where `f` exceeds `level` within the box.
 fn within(bounds: [DVec3; 2], resolution: usize, level: f32, closed: bool, f: impl Fn(DVec3) -> f64 + Sync) -> Mesh {
     let [low, high] = bounds;
     let inside = |x: DVec3| x.cmpge(low).all() && x.cmple(high).all();
@@ -22,7 +22,7 @@ fn within(bounds: [DVec3; 2], resolution: usize, level: f32, closed: bool, f: im
     isosurface(&Lattice::over(bounds, resolution, closed).unwrap(), level, &cut, &mut |_| ()).unwrap()
 }
 
-/// Vertices less edges plus triangles, of a closed mesh.
+/// The Euler characteristic of a closed mesh: vertices minus edges plus triangles.
 fn euler(mesh: &Mesh) -> i64 {
     assert_eq!(mesh.triangles.len() % 2, 0);
     mesh.positions.len() as i64 - mesh.triangles.len() as i64 / 2
@@ -31,7 +31,7 @@ fn euler(mesh: &Mesh) -> i64 {
 const BOX: [DVec3; 2] = [DVec3::new(-1.0, -2.0, 0.0), DVec3::new(2.0, 0.5, 1.5)];
 
 #[test]
-fn a_ball_off_the_middle_of_a_box_with_unequal_sides() {
+fn isosurface_of_ball_is_accurate() {
     let (centre, radius) = (DVec3::new(0.7, -0.9, 0.8), 0.5);
     for (name, density) in [
         ("soft", Box::new(move |x: DVec3| 3.0 + radius - x.distance(centre)) as Box<dyn Fn(DVec3) -> f64 + Sync>),
@@ -39,8 +39,8 @@ fn a_ball_off_the_middle_of_a_box_with_unequal_sides() {
         ("hard", Box::new(move |x: DVec3| if x.distance(centre) < radius { 100.0 } else { 0.0 })),
     ] {
         let mesh = within(BOX, 60, 3.0, true, density);
-        // Cells are of .05. Where it is smooth the places are exact to a hundredth of a 32nd of that, which vertices keep from
-        // the ends; where it is not, to a 32nd.
+        // Cells are 0.05 wide and bisected to a 32nd. Smooth values leave an error of a hundredth of that, the
+        // vertices' margin; a jump leaves all of it.
         let bound = match name {
             "soft" => 0.011 * 0.05 / 32.0,
             "steep" => 5e-5,
@@ -50,7 +50,7 @@ fn a_ball_off_the_middle_of_a_box_with_unequal_sides() {
             mesh.positions.iter().map(|x| (x.distance(centre) - radius).abs()).fold(0.0, raygrad_tensor::Real::maximum);
         assert!(off < bound, "{name}: {off}");
         assert!(mesh.is_closed() && euler(&mesh) == 2 && mesh.components().1 == 1, "{name}");
-        // Triangles lie within the ball by about an eighth of a squared cell over the radius.
+        // Triangles lie inside the ball by about a squared cell over eight radii.
         let (volume, area) = (4.0 / 3.0 * PI * radius.powi(3), 4.0 * PI * radius.powi(2));
         assert!((0.985..1.002).contains(&(mesh.volume() / volume)), "{name}: {}", mesh.volume() / volume);
         assert!((0.985..1.01).contains(&(mesh.area() / area)), "{name}: {}", mesh.area() / area);
@@ -58,7 +58,7 @@ fn a_ball_off_the_middle_of_a_box_with_unequal_sides() {
             let [a, b, c] = mesh.corners(i);
             let normal = (b - a).cross(c - a);
             assert!(normal.length() > 0.0, "{name}: {a} {b} {c} has no area");
-            // Needles of the hard one may stand across.
+            // Needles of the discontinuous function may have any normal.
             let out = normal.normalize().dot((a + b + c) / 3.0 - centre);
             assert!(name == "hard" || out > 0.4 * radius, "{name}: {a} {b} {c} faces elsewhere");
         }
@@ -66,7 +66,7 @@ fn a_ball_off_the_middle_of_a_box_with_unequal_sides() {
 }
 
 #[test]
-fn a_torus_has_a_hole() {
+fn isosurface_of_torus_has_a_hole() {
     let torus = |x: DVec3| {
         let x = x - DVec3::new(0.5, -0.75, 0.7);
         let around = (x.y.hypot(x.z) - 0.45).hypot(x.x);
@@ -84,10 +84,10 @@ fn a_torus_has_a_hole() {
 
 #[test]
 fn surface_is_closed_at_the_box_if_wanted() {
-    // A slab across the box: from y = -1.2 to -.2 and from border to border in x and z.
+    // A slab across the box: y from -1.2 to -0.2, the whole range in x and z.
     let slab = |x: DVec3| 5.0 * (0.5 - (x.y + 0.7).abs());
     let mesh = within(BOX, 50, 1.0, true, slab);
-    // Where the density is 1: .3 on either side of the middle.
+    // The density is 1 at a distance of 0.3 from the middle.
     let volume = 3.0 * 0.6 * 1.5;
     assert!(mesh.is_closed() && euler(&mesh) == 2);
     assert!((mesh.volume() / volume - 1.0).abs() < 0.01, "{} {volume}", mesh.volume());
@@ -103,11 +103,11 @@ fn surface_is_closed_at_the_box_if_wanted() {
 }
 
 #[test]
-fn whatever_is_dense_the_surface_has_no_holes() {
+fn isosurface_of_random_cells_has_no_holes() {
     for seed in 0..20 {
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let share = [0.5, 0.1, 0.9][seed as usize % 3];
-        // Nodes are at -.5, .5 ... 9.5 along x, and fewer along y and z: the outermost are outside.
+        // Nodes are at -0.5, 0.5 .. 9.5 along x, and fewer along y and z; the outermost ones are outside of the box.
         let dense: Vec<bool> = (0..9 * 8 * 7).map(|_| rng.random::<f64>() < share).collect();
         let value = |x: DVec3| {
             let [i, j, k] = x.to_array().map(|x| x.floor() as usize);
@@ -117,7 +117,7 @@ fn whatever_is_dense_the_surface_has_no_holes() {
         let bounds = [DVec3::ZERO, DVec3::new(9.0, 8.0, 7.0)];
         let mesh = within(bounds, 9, 0.5, true, value);
         assert!(mesh.is_closed(), "seed {seed}");
-        // No two vertices are in one place, and no triangle is flat.
+        // No two vertices coincide, and no triangle is degenerate.
         let mut places: Vec<[u64; 3]> = mesh.positions.iter().map(|x| x.to_array().map(f64::to_bits)).collect();
         places.sort_unstable();
         places.dedup();
@@ -126,15 +126,15 @@ fn whatever_is_dense_the_surface_has_no_holes() {
             let [a, b, c] = mesh.corners(i);
             (b - a).cross(c - a).length() > 1e-6
         }));
-        // Each dense node is worth about a cell, less what is cut off its corners, if hardly any touch.
+        // Each dense node contributes about a cell, minus its corners, if few nodes touch.
         let count = dense.iter().filter(|dense| **dense).count() as f64;
         assert!(mesh.volume() > 0.1 * count && mesh.volume() < 1.3 * count, "seed {seed}: {} {count}", mesh.volume());
     }
 }
 
 #[test]
-fn vertices_do_not_meet_where_a_node_has_the_level() {
-    // An octahedron with nodes on its surface: up to three edges of the lattice end in each.
+fn vertices_stay_apart_at_nodes_on_the_level() {
+    // An octahedron with nodes on its surface: up to three lattice edges end in each.
     let octahedron = of(|x| 2.0 - x.abs().element_sum());
     let lattice = Lattice::over([DVec3::splat(-3.0), DVec3::splat(3.0)], 6, false).unwrap();
     let mesh = isosurface(&lattice, 0.0, &octahedron, &mut |_| ()).unwrap();
@@ -145,7 +145,7 @@ fn vertices_do_not_meet_where_a_node_has_the_level() {
 }
 
 #[test]
-fn no_number_breaks_a_surface() {
+fn isosurface_of_extreme_values_is_closed() {
     let strange = |x: DVec3| match x.floor().element_sum() as i64 % 5 {
         0 => f64::INFINITY,
         1 => f64::NAN,
@@ -156,14 +156,14 @@ fn no_number_breaks_a_surface() {
     let mesh = within([DVec3::ZERO, DVec3::new(9.0, 8.0, 7.0)], 9, 0.5, true, strange);
     assert!(mesh.is_closed() && !mesh.triangles.is_empty());
     assert!(mesh.positions.iter().all(|place| place.is_finite()));
-    // What is nowhere more than the level has no surface, and that which is so everywhere is the box.
+    // A function that nowhere exceeds the level has no surface; one that does everywhere gives the box.
     assert_eq!(within(BOX, 20, 0.5, true, |_| 0.5).triangles.len(), 0);
     let full = within(BOX, 20, 0.5, true, |_| 0.6);
     assert!((full.volume() / (3.0 * 2.5 * 1.5) - 1.0).abs() < 0.01, "{}", full.volume());
 }
 
 #[test]
-fn lattices_have_cells_of_nearly_one_edge() {
+fn lattice_cells_are_nearly_cubes() {
     let lattice = Lattice::over(BOX, 30, false).unwrap();
     assert_eq!((lattice.nodes, lattice.low, lattice.cell()), ([31, 26, 16], BOX[0], 0.1));
     assert!(lattice.node([30, 25, 15]).abs_diff_eq(BOX[1], 1e-12));
@@ -186,7 +186,7 @@ fn lattices_have_cells_of_nearly_one_edge() {
 
 #[test]
 fn isosurface_of_infinite_density_is_symmetric() {
-    // What is hidden has them: at the lower end of edges in one case, at the upper end in the other.
+    // Unseen space has infinite density: at the lower end of edges in one case, at the upper end in the other.
     let border = |above: bool| {
         let hidden = of(move |x: DVec3| if (x.x > 0.31) == above { f64::INFINITY } else { 0.0 });
         isosurface(&Lattice::over(BOX, 30, false).unwrap(), 3.0, &hidden, &mut |_| ()).unwrap()
@@ -197,8 +197,8 @@ fn isosurface_of_infinite_density_is_symmetric() {
 }
 
 #[test]
-fn a_surface_of_too_many_vertices_is_an_error() {
-    // Fields in all three directions: every edge of the lattice is crossed, 3 x 9 x 10 x 10 of them.
+fn too_many_vertices_are_an_error() {
+    // A checkerboard crosses every edge of the lattice: 3 x 9 x 10 x 10.
     let sponge = of(|x: DVec3| x.round().element_sum().rem_euclid(2.0));
     let lattice = Lattice { low: DVec3::ZERO, cell: DVec3::ONE, nodes: [10; 3] };
     let of_at_most = |most: usize| limited(&lattice, 0.5, &sponge, &mut |_| (), most);

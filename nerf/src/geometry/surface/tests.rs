@@ -1,4 +1,4 @@
-//! Surfaces and points of a model whose field is known.
+//! Surfaces and point clouds of a model with a known field.
 
 use super::*;
 use crate::field::{self, Density, Field, FieldConfig, VoxelConfig};
@@ -10,8 +10,8 @@ use raygrad_nn::Bound;
 use std::f64::consts::{LN_2, PI};
 use std::sync::Arc;
 
-/// Balls whose density rises inwards by a factor of e in each 40th of a unit, from 1 at their rims. From where one
-/// looks at it against a direction d, a place has the colour (d + 1) / 2 channel by channel.
+/// Balls whose density rises inwards by a factor of e per 40th of a unit, from 1 at their rims. Seen along the
+/// direction -d, a point has the colour (d + 1) / 2.
 struct Balls(Vec<(DVec3, f64)>);
 
 const STEEPNESS: f64 = 40.0;
@@ -34,7 +34,7 @@ impl Field<f32> for Balls {
 const CENTRE: DVec3 = DVec3::new(0.3, -0.2, 0.1);
 const RADIUS: f64 = 0.5;
 
-/// A model with this field in a box with unequal sides, with an occupancy grid or without one.
+/// A model with this field in a box with unequal sides. The preset decides on an occupancy grid.
 fn model(balls: &[(DVec3, f64)], preset: Preset) -> Model<f32> {
     model_in([DVec3::new(-1.0, -0.9, -0.8), DVec3::new(1.5, 1.2, 0.9)], balls, preset)
 }
@@ -55,7 +55,7 @@ fn ball() -> Model<f32> {
     model(&[(CENTRE, RADIUS)], Preset::Voxel)
 }
 
-/// Around the ball, of pictures that are not square.
+/// Cameras around the ball, with images that are not square.
 fn cameras() -> Vec<Camera> {
     let camera = |i: usize| {
         let (sin, cos) = (i as f64).sin_cos();
@@ -69,7 +69,7 @@ fn surface(model: &Model<f32>, config: &SurfaceConfig) -> Surface {
     model.surface(&cameras(), config, &mut |_, done| assert!((0.0..=1.0).contains(&done))).unwrap()
 }
 
-/// Of the right number of cells for the balls here.
+/// The resolution suits the balls.
 const CONFIG: SurfaceConfig = SurfaceConfig {
     resolution: Some(80),
     iso_value: None,
@@ -80,11 +80,11 @@ const CONFIG: SurfaceConfig = SurfaceConfig {
 };
 
 #[test]
-fn the_surface_is_where_views_see_it() {
+fn surface_is_at_the_visible_depth() {
     let found = surface(&ball(), &CONFIG);
-    // A ray to the middle has lost half of its light where the density is 40 ln 2; one that comes in at an angle, before.
+    // A ray through the centre has lost half of its light at the density 40 ln 2; an oblique ray has earlier.
     let most = STEEPNESS * LN_2;
-    // The share of rays that come in at more than an angle is its squared sine: at the lower quartile the cosine is a half.
+    // The share of rays beyond an angle of incidence is its squared sine: the lower quartile has the cosine 0.5.
     assert!((0.4 * most..0.6 * most).contains(&found.iso_value), "{} {most}", found.iso_value);
     let radius = RADIUS - found.iso_value.ln() / STEEPNESS;
     let ColoredMesh { mesh, normals, colors } = &found.colored_mesh;
@@ -94,22 +94,22 @@ fn the_surface_is_where_views_see_it() {
     for ((place, normal), color) in mesh.positions.iter().zip(normals).zip(colors) {
         assert!((place.distance(CENTRE) - radius).abs() < 1e-4, "{place}");
         assert!(normal.dot((place - CENTRE).normalize()) > 0.98, "{place} {normal}");
-        // Looked at along the normal: where it points to +x, red is 1.
+        // The colour is that seen along the normal: towards +x, red is 1.
         let expected = normal.to_array().map(|x| 255.0 * (0.5 + 0.5 * x));
         assert!((0..3).all(|k| (f64::from(color[k]) - expected[k]).abs() < 0.51), "{color:?} {expected:?}");
     }
 }
 
 #[test]
-fn a_level_that_is_given_is_taken() {
+fn iso_value_of_the_config_is_used() {
     for level in [1.0, 500.0] {
         let found = surface(&ball(), &SurfaceConfig { iso_value: Some(level), ..CONFIG });
         let radius = RADIUS - level.ln() / STEEPNESS;
         assert!(found.iso_value == level && !found.colored_mesh.mesh.positions.is_empty());
         let off = |place: &DVec3| (place.distance(CENTRE) - radius).abs();
         assert!(found.colored_mesh.mesh.positions.iter().all(|place| off(place) < 1e-4), "{level}");
-        // Nothing but what is near was asked, of 82 x 69 x 56 nodes; for each vertex five times for its place and six times for
-        // its normal.
+        // Of 82 x 69 x 56 nodes, only those near the surface are evaluated. Each vertex takes five evaluations for its
+        // position and six for its normal.
         let (asked, vertices) = (found.evaluations, found.colored_mesh.mesh.positions.len() as u64);
         assert!((11 * vertices + 5000..150_000).contains(&asked.density), "{asked:?} {vertices}");
         assert_eq!(asked.color, vertices);
@@ -119,10 +119,10 @@ fn a_level_that_is_given_is_taken() {
 }
 
 #[test]
-fn what_pictures_leave_out_is_empty() {
+fn skipped_cells_have_no_surface() {
     let mut half = ball();
     if let Some(marching) = half.marching_mut() {
-        // Cells are of .078125: those up to x = .25 stay.
+        // Cells are 0.078125 wide: those up to x = 0.25 stay.
         let left = |points: &[[f32; 3]], out: &mut [f32]| {
             points.iter().zip(out).for_each(|(x, out)| *out = if x[0] < 0.25 { 1.0 } else { 0.0 });
         };
@@ -131,7 +131,7 @@ fn what_pictures_leave_out_is_empty() {
     half.finish();
     let found = surface(&half, &SurfaceConfig { iso_value: Some(1.0), ..CONFIG });
     let mesh = &found.colored_mesh.mesh;
-    // A cap of height RADIUS - .05, as the cut is at .25.
+    // A cap of the height RADIUS - 0.05, since the cut is at 0.25.
     let height: f64 = RADIUS - 0.05;
     let cap = PI * height * height * (3.0 * RADIUS - height) / 3.0;
     assert!(mesh.is_closed() && (mesh.volume() / cap - 1.0).abs() < 0.01, "{} {cap}", mesh.volume());
@@ -139,20 +139,20 @@ fn what_pictures_leave_out_is_empty() {
 }
 
 #[test]
-fn a_model_without_a_grid_has_the_same_surface() {
+fn surface_without_grid_equals_that_with_grid() {
     let config = SurfaceConfig { iso_value: Some(2.0), ..CONFIG };
     let with = surface(&ball(), &config);
     let without = surface(&model(&[(CENTRE, RADIUS)], Preset::Small), &config);
     assert_eq!(with.colored_mesh.mesh, without.colored_mesh.mesh);
-    // It was looked for in a grid first, and is not asked for everywhere on the lattice.
+    // The search starts on a grid, so it does not evaluate the whole lattice.
     assert!(without.evaluations.density > 128 * 128 * 128 / 4 && with.evaluations.density < 200_000);
 }
 
 #[test]
-fn small_parts_and_triangles_too_many_are_left_out() {
+fn surface_drops_small_parts_and_decimates() {
     let balls = [(CENTRE, RADIUS), (DVec3::new(-0.7, 0.8, -0.4), 0.15)];
     let config = SurfaceConfig { iso_value: Some(1.0), ..CONFIG };
-    // Its area is .09 of the other's.
+    // Its area is 0.09 of the other's.
     for (parts, dropped) in [(0.0, 0), (0.05, 0), (0.15, 1)] {
         let found = surface(&model(&balls, Preset::Voxel), &SurfaceConfig { min_component: parts, ..config });
         assert_eq!((found.dropped, found.colored_mesh.mesh.components().1), (dropped, 2 - dropped), "{parts}");
@@ -164,8 +164,8 @@ fn small_parts_and_triangles_too_many_are_left_out() {
 }
 
 #[test]
-fn what_meets_the_box_is_closed_or_open() {
-    // Its middle is on the border of the box.
+fn surface_at_the_box_is_closed_or_open() {
+    // The centre of the ball is on a side of the box.
     let model = model(&[(DVec3::new(1.5, 0.2, 0.0), RADIUS)], Preset::Voxel);
     let config = SurfaceConfig { iso_value: Some(1.0), ..CONFIG };
     let [closed, open] =
@@ -173,7 +173,7 @@ fn what_meets_the_box_is_closed_or_open() {
     let half = 2.0 / 3.0 * PI * RADIUS.powi(3);
     assert!(closed.is_closed() && (closed.volume() / half - 1.0).abs() < 0.015, "{} {half}", closed.volume());
     assert!(!open.is_closed() && (open.area() / (2.0 * PI * RADIUS.powi(2)) - 1.0).abs() < 0.015, "{}", open.area());
-    // Faces that f32 has further out, where nothing is shown: at 1.7, and at -.6.
+    // f32 rounds these faces outwards, where nothing is rendered: 1.7 and -0.6.
     for (centre, [low, high]) in
         [(1.7, [DVec3::new(-1.0, -0.9, -0.8), DVec3::new(1.7, 1.2, 0.9)]), (-0.6, [DVec3::splat(-0.6), DVec3::ONE])]
     {
@@ -186,7 +186,7 @@ fn what_meets_the_box_is_closed_or_open() {
 }
 
 #[test]
-fn what_cannot_be_made_is_said() {
+fn surface_errors_name_the_setting() {
     let message = |config: SurfaceConfig, cameras: &[Camera]| {
         ball().surface(cameras, &config, &mut |_, _| ()).err().unwrap().to_string()
     };
@@ -194,7 +194,7 @@ fn what_cannot_be_made_is_said() {
         (SurfaceConfig { iso_value: Some(-1.0), ..CONFIG }, "`iso_value`: is -1"),
         (SurfaceConfig { iso_value: Some(f64::NAN), ..CONFIG }, "`iso_value`: is NaN"),
         (SurfaceConfig { iso_value: Some(1e30), ..CONFIG }, "`iso_value`: is 1000000000000000000000000000000"),
-        // What is hidden is not dense enough for it.
+        // The visible density is below the iso-value.
         (
             SurfaceConfig { iso_value: Some(1e30), fill_unseen: true, ..CONFIG },
             "`iso_value`: is 1000000000000000000000000000000",
@@ -217,16 +217,17 @@ fn what_cannot_be_made_is_said() {
 }
 
 #[test]
-fn points_are_what_cameras_see() {
+fn point_cloud_covers_the_visible_surface() {
     let model = ball();
     let found = model.point_cloud(&cameras(), 2000, &mut |_, done| assert!((0.0..=1.0).contains(&done))).unwrap();
     let ColoredMesh { mesh, normals, colors } = &found.colored_mesh;
     let count = mesh.positions.len();
     assert!((1500..=2000).contains(&count) && mesh.triangles.is_empty(), "{count}");
-    // Twelve rays for each point that is wanted, however many cameras there are.
+    // Twelve rays per requested point, for any number of cameras.
     assert!((2 * count..12 * 2000 + 6 * 300).contains(&found.sights), "{}", found.sights);
     assert!([normals.len(), colors.len()] == [count; 2]);
-    // Straight on, light is halved where the density is 40 ln 2, and in the middle of a step; at the rim, nearer to the eye.
+    // Frontal rays lose half of their light at the density 40 ln 2, in the middle of a step; rays at the rim do so
+    // nearer to the eye.
     let deepest = RADIUS - (STEEPNESS * LN_2).ln() / STEEPNESS;
     for ((place, normal), color) in mesh.positions.iter().zip(normals).zip(colors) {
         let radius = place.distance(CENTRE);
@@ -234,7 +235,7 @@ fn points_are_what_cameras_see() {
         assert!(normal.dot((place - CENTRE).normalize()) > 0.98, "{place} {normal}");
         assert!((f64::from(color[2]) - 255.0 * (0.5 + 0.5 * normal.z)).abs() < 0.51, "{color:?} {normal}");
     }
-    // From all sides: the middle of the points is near that of the ball.
+    // The points are on all sides: their mean is near the ball's centre.
     let middle = mesh.positions.iter().sum::<DVec3>() / count as f64;
     assert!(middle.distance(CENTRE) < 0.1, "{middle}");
     let deep = mesh.positions.iter().filter(|place| place.distance(CENTRE) < deepest + 0.003).count();
@@ -242,25 +243,25 @@ fn points_are_what_cameras_see() {
 }
 
 #[test]
-fn what_no_camera_sees_is_solid_if_it_is_to_be() {
-    // A hole in the middle of the ball: a void of radius .2, which a shell of .3 hides.
-    // The cells of the void are occupied, as those of a sponge are.
+fn fill_unseen_closes_hidden_voids() {
+    // A ball with a void of the radius 0.2 inside a shell 0.3 thick. The cells of the void are occupied, like those of
+    // a sponge.
     let mut hollow = ball();
     hollow.field = Arc::new(Hollow);
     let config = SurfaceConfig { iso_value: Some(2.0), min_component: 0.0, ..CONFIG };
     let open = surface(&hollow, &config).colored_mesh.mesh;
     let full = surface(&hollow, &SurfaceConfig { fill_unseen: true, ..config }).colored_mesh.mesh;
     assert_eq!((open.components().1, full.components().1), (2, 1));
-    // The outside is where it was.
+    // The outer surface is unchanged.
     let whole = surface(&ball(), &config).colored_mesh.mesh;
     assert!((full.volume() / whole.volume() - 1.0).abs() < 1e-4, "{} {}", full.volume(), whole.volume());
     assert!(open.volume() < 0.95 * whole.volume() && full.is_closed());
-    // Without cameras nothing is known to be hidden.
+    // Without cameras nothing counts as unseen.
     let blind = hollow.surface(&[], &SurfaceConfig { fill_unseen: true, ..config }, &mut |_, _| ()).unwrap();
     assert_eq!(blind.colored_mesh.mesh, open);
 }
 
-/// The ball with a void in its middle.
+/// The ball with a void at its centre.
 struct Hollow;
 
 impl Field<f32> for Hollow {
@@ -275,7 +276,7 @@ impl Field<f32> for Hollow {
 }
 
 #[test]
-fn colors_have_the_tone_of_views() {
+fn surface_colors_have_the_exposure_of_renders() {
     let rate = Some(raygrad_nn::Schedule::Constant { rate: 0.1 });
     let mut config = Config::preset(Preset::Voxel);
     config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
@@ -288,7 +289,8 @@ fn colors_have_the_tone_of_views() {
     model.params.get_mut(exposure).as_mut_slice().iter_mut().zip(numbers).for_each(|(out, x)| *out = x);
     model.params.get_mut(vignetting).as_mut_slice().fill(-1.0);
     let places = [CENTRE + 0.4 * DVec3::new(0.6, 0.0, 0.8)];
-    // Of no photograph in particular, the geometric mean; in the middle of the picture, without darker corners.
+    // Without an image the gain is the geometric mean. Vignetting does not apply: colours are those at the image
+    // centre.
     for (look, gains) in [(Some(0), gains[0]), (Some(1), gains[1]), (None, [0.5_f32.sqrt(), 0.5, 0.5])] {
         model.appearance_image = look;
         let (_, colors) = Probe::new(&model).look(None, 0.02, &places);
@@ -299,7 +301,7 @@ fn colors_have_the_tone_of_views() {
 }
 
 #[test]
-fn nothing_is_outside_of_the_box() {
+fn density_outside_of_the_box_is_zero() {
     let model = model(&[(DVec3::new(1.5, 0.2, 0.0), RADIUS)], Preset::Voxel);
     let mut found = [f32::NAN; 3];
     Probe::new(&model).shown(None, None, &[[1.49, 0.2, 0.0], [1.51, 0.2, 0.0], [1.2, 0.2, 0.0]], &mut found);

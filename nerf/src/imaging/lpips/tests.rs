@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
 use std::sync::LazyLock;
 
-/// Numbers from -1 to 1 without a pattern, as in `tests/reference/lpips.py`.
+/// Pseudo-random numbers from -1 to 1, as in `tests/reference/lpips.py`.
 fn noise(i: usize, salt: u32) -> f64 {
     let mut i = (i as u32).wrapping_mul(2_654_435_761).wrapping_add(salt.wrapping_mul(40503));
     for _ in 0..2 {
@@ -14,7 +14,7 @@ fn noise(i: usize, salt: u32) -> f64 {
     f64::from(i ^ (i >> 16)) / 2.0_f64.powi(31) - 1.0
 }
 
-/// Names and shapes in the order of the package.
+/// Names and shapes in the order of the authors' package.
 fn names(backbone: Backbone) -> Vec<(String, Vec<usize>)> {
     let [stem, layers]: [&[usize]; 2] = match backbone {
         Backbone::Alex => [&[11, 5, 3, 3, 3], &[10, 23, 36, 48, 510]],
@@ -28,7 +28,7 @@ fn names(backbone: Backbone) -> Vec<(String, Vec<usize>)> {
         Backbone::Alex => [64, 192, 384, 256, 256],
         Backbone::Vgg => [64, 128, 256, 512, 512],
     };
-    // The slice is the first digit, its layer the others.
+    // The first digit is the slice; the others are its layer.
     let split = |layer: &usize| {
         let text = layer.to_string();
         format!("net.slice{}.{}", &text[..1], &text[1..])
@@ -71,7 +71,7 @@ static VGG_WEIGHTS: LazyLock<Params<f32>> = LazyLock::new(|| weights(Backbone::V
 static WITH_ALEX: LazyLock<Lpips> = LazyLock::new(|| opened(&bytes(&ALEX_WEIGHTS)).unwrap());
 static WITH_VGG: LazyLock<Lpips> = LazyLock::new(|| opened(&bytes(&VGG_WEIGHTS)).unwrap());
 
-/// The pictures of `tests/reference/lpips.py`.
+/// The images of `tests/reference/lpips.py`.
 fn pictures(width: usize, height: usize) -> [Tensor<f32>; 2] {
     let shape = [2, 3, height, width];
     let stripes = |i: usize| ((i % (7 * width) + 3 * (i % width)) % 64) as f64 / 63.0;
@@ -81,7 +81,7 @@ fn pictures(width: usize, height: usize) -> [Tensor<f32>; 2] {
     [a, b]
 }
 
-/// One of a batch as an image.
+/// An image of a batch.
 fn image(batch: &Tensor<f32>, i: usize) -> Image {
     let &[_, channels, height, width] = batch.shape() else { panic!("no images") };
     let at = |p: usize| ((i * channels + p % channels) * height * width) + p / channels;
@@ -99,9 +99,9 @@ fn of<T: Scalar>(lpips: &Lpips<T>, pair: &[Tensor<f32>; 2]) -> Vec<Vec<f64>> {
     (0..2).map(|i| layers.iter().map(|layer| layer[i]).collect()).collect()
 }
 
-/// `tests/reference/lpips.py` asked the authors' package.
+/// `tests/reference/lpips.py` computed the expected values with the authors' package.
 #[test]
-fn distances_are_those_of_the_package_layer_by_layer() {
+fn lpips_equals_the_authors_package_by_layer() {
     let file = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/reference/lpips.json");
     let values: HashMap<String, Vec<Vec<f64>>> = serde_json::from_slice(&std::fs::read(file).unwrap()).unwrap();
     assert_eq!(values.len(), 4);
@@ -127,7 +127,7 @@ fn distances_are_those_of_the_package_layer_by_layer() {
 }
 
 #[test]
-fn the_distance_is_one() {
+fn lpips_is_zero_for_equal_images_and_symmetric() {
     let [a, b] = pictures(35, 32).each_ref().map(|batch| image(batch, 1));
     for lpips in [&*WITH_ALEX, &*WITH_VGG] {
         assert_eq!([lpips.distance(&a, &a), lpips.distance(&b, &b)], [0.0; 2]);
@@ -141,7 +141,7 @@ fn the_distance_is_one() {
 }
 
 #[test]
-fn gradients_are_what_differences_show() {
+fn lpips_gradients_equal_differences() {
     let lpips = WITH_ALEX.cast::<f64>();
     let [a, b] =
         pictures(33, 31).map(|x| Tensor::from_vec(&[1, 3, 31, 33], x.as_slice()[..3 * 31 * 33].to_vec()).cast());
@@ -168,7 +168,7 @@ fn ray_without_density_has_no_depth_or_gradient() {
 }
 
 #[test]
-fn images_that_are_too_small_are_refused() {
+fn lpips_of_too_small_images_panics() {
     for (lpips, side) in [(&*WITH_ALEX, 31), (&*WITH_VGG, 16)] {
         assert_eq!(lpips.backbone().smallest(), side);
         let of = |width: usize, height: usize| {
@@ -187,18 +187,18 @@ fn images_that_are_too_small_are_refused() {
 
 #[test]
 #[should_panic(expected = "images must have the same height, width and channels")]
-fn other_shapes_are_refused() {
+fn lpips_of_different_shapes_panics() {
     WITH_ALEX.distance(&Image::new(40, 41, 3), &Image::new(41, 40, 3));
 }
 
 #[test]
 #[should_panic(expected = "LPIPS needs three channels: red, green and blue")]
-fn transparency_is_refused() {
+fn lpips_of_transparent_images_panics() {
     WITH_ALEX.distance(&Image::new(40, 41, 4), &Image::new(40, 41, 4));
 }
 
 #[test]
-fn files_that_do_not_serve_are_errors_that_say_why() {
+fn unusable_lpips_files_are_errors_with_a_reason() {
     let good = &*ALEX_WEIGHTS;
     let whole = bytes(good);
     let refused = |bytes: &[u8], expected: &[&str]| {
@@ -210,7 +210,7 @@ fn files_that_do_not_serve_are_errors_that_say_why() {
     for length in [4, 100, whole.len() / 2, whole.len() - 1] {
         refused(&whole[..length], &["not a safetensors file"]);
     }
-    // A header that announces more than there is, and more than any memory holds.
+    // Headers that announce more than the file, and more than any memory, can hold.
     let header = |text: &str| [&(text.len() as u64).to_le_bytes(), text.as_bytes()].concat();
     refused(&(u64::MAX / 2).to_le_bytes(), &["not a safetensors file"]);
     for shape in ["[4000000000,4000000000,3,3]", "[1099511627776]"] {
@@ -220,10 +220,10 @@ fn files_that_do_not_serve_are_errors_that_say_why() {
     let mut others = Params::new();
     others.add("net.slice1.0.weight", Tensor::zeros(&[1]));
     refused(&bytes(&others), &["neither `net.slice2.3.weight` (alex) nor `net.slice1.2.weight` (vgg)"]);
-    // Each tensor is looked for, by its own name and shape.
+    // Each tensor is checked by its own name and shape.
     let needed = names(Backbone::Alex).into_iter().filter(|(name, _)| name != ALEX.sign);
     for (absent, shape) in needed {
-        // Under another name.
+        // The same tensor under another name.
         let mut others = whole.clone();
         let quoted = format!("\"{absent}\"");
         let at = whole.windows(quoted.len()).position(|part| part == quoted.as_bytes()).unwrap();
@@ -252,7 +252,7 @@ fn files_that_do_not_serve_are_errors_that_say_why() {
         tensor.as_mut_slice()[last] = value;
         refused(&changed(name, tensor), &[&format!("`{name}`: {expected}")]);
     }
-    // What else a `state_dict` holds does no harm.
+    // Other entries of a `state_dict` are ignored.
     let mut more = good.clone();
     more.add("scaling_layer.shift", Tensor::zeros(&[1, 3, 1, 1]));
     assert_eq!(opened(&bytes(&more)).unwrap().backbone(), Backbone::Alex);
@@ -262,14 +262,14 @@ fn files_that_do_not_serve_are_errors_that_say_why() {
 
 #[cfg(unix)]
 #[test]
-fn a_file_without_end_is_not_read_to_its_end() {
+fn endless_lpips_file_is_not_read_to_its_end() {
     let error = Lpips::open("/dev/zero").unwrap_err().to_string();
     assert!(error.starts_with("/dev/zero: has more than 134217728 bytes"), "{error}");
 }
 
 #[test]
-fn no_number_is_one_at_the_borders_too() {
-    // AlexNet's first windows end at the 33rd of 34 columns.
+fn lpips_of_nan_at_the_border_is_nan() {
+    // AlexNet's last window ends at the 33rd of 34 columns.
     let mut image = Image::new(34, 31, 3);
     image.pixel_mut(33, 30)[2] = f32::NAN;
     let black = Image::new(34, 31, 3);

@@ -12,14 +12,14 @@ use glam::DVec3;
 /// Numbers of a pose: a rotation vector and a translation.
 pub(super) const POSE: usize = 6;
 
-/// A matrix, row by row.
+/// A row-major matrix.
 pub(super) type Matrix = [[f64; POSE]; POSE];
 
-/// Sampled pixels along each side of an image, and points along each of their rays.
+/// Pixels along each side of an image, and points along each of their rays.
 const PLACES: [usize; 2] = [6, 3];
-/// What is added to the diagonal, as a part of it: how far a valley is widened at most.
+/// The relative damping of the diagonal, which bounds how far weak directions are amplified.
 const DAMPING: f64 = 0.1;
-/// What a number moves at least, squared: a single ray along an axis shows nothing of a turn about that.
+/// The least squared motion per parameter: a single ray along an axis does not show a rotation about that axis.
 const LEAST: f64 = 1e-12;
 
 /// The upper triangular matrix from six numbers to a rotation vector (radians, scene axes) about the camera's centre
@@ -57,7 +57,7 @@ pub(super) fn balance(camera: &Camera, bounds: [DVec3; 2], span: [f64; 2], unit:
     inverse_transposed(&cholesky(&sum))
 }
 
-/// That of a camera that sees nothing of the box, or of which nothing is known: as if that were one unit away.
+/// The matrix of a camera that does not see the box, or is unknown: as if the box were one unit away.
 pub(super) fn plain(unit: f64) -> Matrix {
     let entry = |a: usize, b: usize| match (a == b, a < 3) {
         (true, true) => 1.0,
@@ -67,8 +67,8 @@ pub(super) fn plain(unit: f64) -> Matrix {
     std::array::from_fn(|a| std::array::from_fn(|b| entry(a, b)))
 }
 
-/// How the direction to a place at the distance `t` along a unit direction moves, seen from a camera that turns or
-/// moves: rows of three components, columns of six numbers.
+/// The derivative of the direction to a point at the distance `t` along a unit direction, by the camera's rotation and
+/// translation: three rows, six columns.
 fn slopes(direction: DVec3, t: f64) -> [[f64; POSE]; 3] {
     let axes = [DVec3::X, DVec3::Y, DVec3::Z];
     let turned = axes.map(|axis| -axis.cross(direction));
@@ -77,7 +77,7 @@ fn slopes(direction: DVec3, t: f64) -> [[f64; POSE]; 3] {
     std::array::from_fn(|i| std::array::from_fn(|k| columns[k][i]))
 }
 
-/// The lower triangle L of a symmetric positive matrix `L L^T`.
+/// The Cholesky factor L of a symmetric positive definite matrix `L L^T`.
 fn cholesky(matrix: &Matrix) -> Matrix {
     let mut lower = [[0.0; POSE]; POSE];
     for i in 0..POSE {
@@ -89,11 +89,11 @@ fn cholesky(matrix: &Matrix) -> Matrix {
     lower
 }
 
-/// The inverse of the transpose of a lower triangle.
+/// The inverse of the transpose of a lower triangular matrix.
 fn inverse_transposed(lower: &Matrix) -> Matrix {
     let mut out = [[0.0; POSE]; POSE];
     for column in 0..POSE {
-        // Upper triangular: from the last row up.
+        // The result is upper triangular, so rows are solved from the last one up.
         for row in (0..=column).rev() {
             let own = if row == column { 1.0 } else { 0.0 };
             let rest = own - (row + 1..=column).map(|k| lower[k][row] * out[k][column]).sum::<f64>();
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn correction_steps_move_images_alike() {
+    fn balance_steps_move_the_image_equally() {
         for lens in [Lens::Pinhole, Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] }] {
             let camera = Camera { lens, ..camera() };
             let matrix = balance(&camera, BOX, [0.1, 9.0], 1.0, false);
@@ -147,7 +147,7 @@ mod tests {
             assert!(seen.as_flattened().iter().all(|x| x.is_finite()), "{seen:?}");
             assert!(alike(&plain) > 0.9 && alike(&seen) < 0.7, "{} {}", alike(&plain), alike(&seen));
             for a in 0..POSE {
-                // Damping leaves what moves least behind.
+                // Damping reduces the smallest motions.
                 assert!((0.1..1.0).contains(&(seen[a][a] / count)), "{seen:?}");
                 assert!((0..a).all(|b| matrix[a][b] == 0.0));
             }
@@ -155,14 +155,14 @@ mod tests {
     }
 
     #[test]
-    fn slopes_are_those_of_differences() {
+    fn balance_slopes_equal_differences() {
         let (direction, t, step) = (DVec3::new(0.3, -0.5, 0.8).normalize(), 2.5, 1e-6);
         let found = slopes(direction, t);
         for k in 0..POSE {
             let mut numbers = [0.0; POSE];
             numbers[k] = step;
             let [x, y, z, a, b, c] = numbers;
-            // The camera turns by that: what it sees turns back. It moves: what it sees moves back.
+            // Points turn and move against the camera.
             let turn = crate::camera::rotation_matrix(DVec3::new(x, y, z));
             let moved = (turn.transpose() * (t * direction - DVec3::new(a, b, c))).normalize();
             for i in 0..3 {
@@ -172,21 +172,21 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_beyond_an_open_scene_counts_too() {
-        // The box is small in the picture: within it, a turn about the axis that the camera looks along shows little.
+    fn balance_counts_points_beyond_an_unbounded_scene() {
+        // The box is small in the image, so that a rotation about the optical axis hardly shows in it.
         let narrow = camera();
         let small = BOX.map(|corner| 0.5 * corner);
         let turned = |unbounded| {
             let matrix = balance(&narrow, small, [0.1, 9.0], 1.0, unbounded);
             assert!(matrix.as_flattened().iter().all(|x| x.is_finite()), "{matrix:?}");
-            // The largest turn about any axis that one of the first three numbers makes.
+            // The largest rotation by one of the first three numbers.
             (0..3).map(|b| DVec3::new(matrix[0][b], matrix[1][b], matrix[2][b]).length()).fold(0.0, f64::max)
         };
         assert!(turned(true) < 0.85 * turned(false), "{} {}", turned(true), turned(false));
     }
 
     #[test]
-    fn a_scene_in_other_units_is_balanced_alike() {
+    fn balance_does_not_depend_on_units() {
         let (near, mut far) = (camera(), camera());
         far.pose.translation *= 100.0;
         let a = balance(&near, BOX, [0.1, 9.0], 1.0, false);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn camera_that_sees_nothing_is_moved_unscaled() {
+    fn balance_of_camera_without_view_is_plain() {
         let away = Camera::from_angle(4, 4, 0.5, Camera::look_at(DVec3::X * 5.0, DVec3::X * 9.0, DVec3::Z));
         let matrix = balance(&away, BOX, [0.1, 9.0], 1.5, true);
         assert!((0..POSE).all(|i| matrix[i][i] == if i < 3 { 1.0 } else { 1.5 }) && matrix[0][4] == 0.0);

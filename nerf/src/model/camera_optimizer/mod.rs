@@ -23,7 +23,7 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId, Params};
 use std::sync::Arc;
 
-/// Relative tolerance within which focal lengths and principal points count as equal.
+/// Relative tolerance for equal focal lengths and principal points.
 const SAME: f64 = 1e-9;
 
 /// Learned corrections of the training cameras; parameters of 0 leave them unchanged.
@@ -57,7 +57,7 @@ pub struct CameraOptimizer {
     groups: Arc<[u32]>,
 }
 
-/// Whether two cameras differ at most in their poses and image sizes.
+/// Returns true if two cameras differ at most in their poses and image sizes.
 fn is_same(a: &Camera, b: &Camera) -> bool {
     let shape = |camera: &Camera| {
         let [width, height] = [camera.width as f64, camera.height as f64];
@@ -81,9 +81,9 @@ fn grouped(cameras: &[Camera]) -> (Vec<u32>, usize) {
     (cameras.iter().map(number).collect(), kinds.len())
 }
 
-/// The same origins, with the gradient of what moves them across their rays alone.
+/// Removes the gradient of the origins along their rays.
 ///
-/// A ray that begins further back is the same line and shows the same. Its samples keep their distances, so they slide
+/// A ray that begins farther back is the same line and shows the same. Its samples keep their distances, so they move
 /// along it, which changes the quadrature's error. That gradient would pull cameras towards thin parts of the scene.
 fn across<'t, T: Scalar>(origins: &Var<'t, T>, directions: &Var<'t, T>) -> Var<'t, T> {
     let (start, along) = (origins.detach(), directions.detach());
@@ -139,7 +139,7 @@ impl CameraOptimizer {
         let poses = poses.then(|| params.add(POSES, Tensor::zeros(&[frames, 6])));
         let focal = focal.then(|| params.add(FOCAL, Tensor::zeros(&[count, 2])));
         let lens = lens.then(|| params.add(LENS, Tensor::zeros(&[count, CORRECTIONS])));
-        // A step sees few of the images.
+        // Sparse updates, since a step uses few of the images.
         params.set_lazy(|name| name == POSES, true);
         let SceneBox { bounds, near_far: span, unit, .. } = *extent;
         let balance = match cameras.is_empty() {
@@ -185,7 +185,7 @@ impl CameraOptimizer {
                 let [focal, lens] = [focal, lens].map(|id| id.map(|id| &params[id]));
                 let value = |var: Option<&Var<'t, T>>| var.map(|var| var.value().clone());
                 let (grown, added) = (value(focal), value(lens));
-                // As many cameras as images, however many rays.
+                // One camera per image, not per ray.
                 let now: Vec<Camera> = (0..self.cameras.len())
                     .map(|i| self.glass(grown.as_ref(), added.as_ref(), Some(self.groups[i]), &self.cameras[i]))
                     .collect();
@@ -232,7 +232,7 @@ impl CameraOptimizer {
         0.5 * (self.extent.bounds[0] + self.extent.bounds[1])
     }
 
-    /// The camera with the focal length and the lens of that group, corrected by these parameters.
+    /// The camera with the refined focal length and lens of its group.
     fn glass<T: Scalar>(
         &self,
         focal: Option<&Tensor<T>>,
@@ -312,7 +312,7 @@ impl CameraOptimizer {
     pub fn transform<T: Scalar>(&self, params: &Params<T>) -> Option<SceneTransform> {
         let growth = self.growth(params, None);
         let rest = self.similarity(params, &vec![growth; self.cameras.len()])?;
-        // The step from the middle, and then the rest.
+        // First the growth from the centre, then the similarity.
         let origin = self.middle() - (self.middle() - rest.origin) / growth;
         Some(SceneTransform { scale: rest.scale * growth, origin, ..rest })
     }

@@ -11,14 +11,14 @@ use glam::DVec3;
 use raygrad_autograd::{Dual, Scalar, Tape, Tensor, Var};
 use std::mem::{Discriminant, discriminant};
 
-/// Numbers that a lens is corrected by.
+/// The number of corrections of a lens.
 pub(super) const CORRECTIONS: usize = 4;
 
-/// Below this determinant of its Jacobian a lens is so near to a fold that its inverse has no slope to speak of.
+/// Below this determinant of its Jacobian a lens is close to a fold, and its inverse has no usable derivative.
 const FOLDED: f64 = 1e-6;
 
-/// The coefficients of a lens that are corrected, by their number: `k1, k2, p1, p2`, and of a fisheye `k1, k2`; the
-/// others hardly affect images and would drift.
+/// The indices of the corrected coefficients: `k1, k2, p1, p2`, or `k1, k2` of a fisheye. Others hardly affect images
+/// and would drift.
 pub(super) fn corrected(lens: &Lens) -> &'static [usize] {
     match lens {
         Lens::Pinhole | Lens::Equirectangular => &[],
@@ -28,30 +28,30 @@ pub(super) fn corrected(lens: &Lens) -> &'static [usize] {
     }
 }
 
-/// The lens with numbers added to the coefficients that are [`corrected`].
+/// The lens with `added` on its [`corrected`] coefficients.
 pub(super) fn with_corrections(lens: &Lens, added: [f64; CORRECTIONS]) -> Lens {
     let mut coefficients = lens.coefficients();
     corrected(lens).iter().zip(added).for_each(|(&i, x)| coefficients[i] += x);
     lens.with_coefficients(&coefficients)
 }
 
-/// A pixel as its camera sees it now, and by how much the direction follows if the place that it is put at moves.
+/// The direction of a pixel for the current camera, and its derivative by the position in the image plane.
 struct Sight {
     lens: Lens,
-    /// In units of the focal length that was given, from the principal point.
+    /// Position in units of the given focal length, from the principal point.
     given: [f64; 2],
-    /// In units of the focal length that is found now.
+    /// Position in units of the current focal length.
     place: [f64; 2],
-    /// In the axes of the [`Lens`].
+    /// Direction in the axes of the [`Lens`].
     local: DVec3,
-    /// In the axes of the scene, and so its slopes.
+    /// Direction in the axes of the scene, like its slopes.
     direction: DVec3,
     slopes: [DVec3; 2],
 }
 
 impl Sight {
-    /// Of a continuous pixel position. `given` is the camera as it was, whose pose the result has; `now` has the focal
-    /// length and the lens that are found now.
+    /// For a continuous pixel position. `given` is the original camera, whose pose the result has; `now` has the
+    /// current focal length and lens.
     fn new(given: &Camera, now: &Camera, [x, y]: [f64; 2]) -> Self {
         let plane =
             |camera: &Camera| [(x - camera.centre[0]) / camera.focal[0], (y - camera.centre[1]) / camera.focal[1]];
@@ -64,7 +64,8 @@ impl Sight {
     }
 }
 
-/// How the unit direction that is put at a place moves with the two coordinates of that; `None` where the lens folds.
+/// The derivative of the unit direction by the two coordinates of its image-plane position; `None` at a fold of the
+/// lens.
 fn slopes(lens: &Lens, local: DVec3) -> Option<[DVec3; 2]> {
     let (a, b) = local.any_orthonormal_pair();
     let direction = [0, 1, 2].map(|i| Dual { value: local[i], slopes: [Some(a[i]), Some(b[i])] });
@@ -77,11 +78,11 @@ fn slopes(lens: &Lens, local: DVec3) -> Option<[DVec3; 2]> {
     (determinant.abs() > FOLDED && found.iter().all(|slope| slope.is_finite())).then_some(found)
 }
 
-/// Unit directions `[rays, 3]`, in the axes of the scene and before any turn of the cameras, of pixels.
+/// Unit directions `[rays, 3]` of pixels, in the axes of the scene, before pose corrections.
 ///
-/// Each ray has the camera as it was given, the same as it is found now, and the continuous position of its pixel.
-/// `focal` `[rays, 2]` are the logarithms of the factors by which focal lengths have grown, `lens` `[rays, 4]` what was
-/// added to the coefficients; what is `None` is not learned.
+/// Each ray has its given camera, its current camera and the continuous position of its pixel. `focal` `[rays, 2]`
+/// holds the logarithms of the focal lengths' growth. `lens` `[rays, 4]` holds the corrections of the coefficients.
+/// `None` is not learned.
 pub(super) fn directions<'t, T: Scalar>(
     tape: &'t Tape<T>,
     pixels: &[(&Camera, &Camera, [f64; 2])],
@@ -98,12 +99,12 @@ pub(super) fn directions<'t, T: Scalar>(
         None => table(2, &|sight, i| sight.place[i]),
     };
     let start = table(3, &|sight, i| sight.direction[i]);
-    // By how much a place misses its target: nothing, but with a gradient.
+    // One Newton step. The residual is 0, but it has a gradient.
     let step = |miss: Var<'t, T>, of: &dyn Fn(&Sight) -> bool| {
         let slopes = table(6, &|sight, i| if of(sight) { sight.slopes[i % 2][i / 2] } else { 0.0 });
         (slopes.reshape(&[count, 3, 2]) * miss.reshape(&[count, 1, 2])).sum_over(-1)
     };
-    // A formula for each kind of lens that there is; rays of other kinds are held at its axis, and do not take its step.
+    // One formula per kind of lens. Rays of other kinds get the optical axis, and their steps are masked out.
     let mut kinds: Vec<(Discriminant<Lens>, Lens)> = vec![];
     for (given, now, _) in pixels {
         let kind = discriminant(&now.lens);

@@ -8,11 +8,11 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// The name of the parameter of poses.
+/// The name of the pose parameter.
 pub(crate) const POSES: &str = "poses";
-/// The name of the parameter of focal lengths.
+/// The name of the focal length parameter.
 pub(crate) const FOCAL: &str = "focal";
-/// The name of the parameter of lenses.
+/// The name of the lens parameter.
 pub(crate) const LENS: &str = "lens";
 
 /// Configuration of the [`CameraOptimizer`](crate::model::CameraOptimizer), beside

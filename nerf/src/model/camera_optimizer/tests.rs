@@ -1,4 +1,4 @@
-//! Corrected cameras, against their rays as numbers and against differences.
+//! Corrected cameras, compared with their rays and with finite differences.
 
 use super::*;
 use crate::dataset::SceneType;
@@ -13,12 +13,12 @@ const SPAN: [f64; 2] = [0.5, 9.0];
 
 const MIDDLE: DVec3 = DVec3::new(0.1, -0.2, 0.3);
 
-/// Of a scene that so many photographs show.
+/// The box of a scene with `frames` images.
 fn extent(frames: usize) -> SceneBox {
     SceneBox { unit: 1.5, frames, ..SceneBox::new([MIDDLE - 1.0, MIDDLE + 1.0], SPAN) }
 }
 
-/// The six numbers by which a camera turns and moves like that.
+/// The six parameters of a rotation and translation.
 fn numbers(refine: &CameraOptimizer, number: usize, correction: [f64; POSE]) -> [f64; POSE] {
     let matrix = &refine.balance[number];
     let mut found = [0.0; POSE];
@@ -29,7 +29,7 @@ fn numbers(refine: &CameraOptimizer, number: usize, correction: [f64; POSE]) -> 
     found
 }
 
-/// Cameras of five kinds; the first two are one that took two photographs.
+/// Six images by cameras of five kinds; the first two share one camera.
 fn cameras() -> Vec<Camera> {
     let pose = |x: f64| Camera::look_at(DVec3::new(x, -3.0, 2.0), DVec3::ZERO, DVec3::Z);
     let camera =
@@ -57,7 +57,7 @@ fn given(cameras: &[Camera]) -> Rays<f64> {
 }
 
 #[test]
-fn rays_are_those_of_the_camera_that_is_corrected() {
+fn corrected_rays_equal_those_of_the_camera() {
     let cameras = cameras();
     for (poses, config) in [
         (true, CameraOptimizerConfig::default()),
@@ -96,7 +96,7 @@ fn rays_are_those_of_the_camera_that_is_corrected() {
     }
 }
 
-/// Something that depends on the lines that rays are, and not on where on them they begin: their moments and directions.
+/// A function of rays as lines, independent of their origins: of their moments and directions.
 fn seen<'t>(vars: &RayVars<'t, f64>) -> Var<'t, f64> {
     let RayVars { origins, directions } = vars;
     let at = |var: &Var<'t, f64>, i: usize| var.slice_axis(1, i..i + 1);
@@ -116,7 +116,7 @@ fn camera_corrections_match_differences() {
     for at in [0.0, 0.05] {
         let start = |shape: &Vec<usize>| Tensor::from_fn(shape, |i| at * (1.3 * i as f64).sin());
         let starts: Vec<_> = shapes.iter().map(start).collect();
-        // The step of Newton's method has the first derivatives of the root, and no others.
+        // A Newton step has the root's first derivatives, but not its second ones.
         let check = Check { second_order: false, ..Check::default() };
         let report = check_function(&check, &starts, |x| {
             let bound = layout.layout().bind(x.to_vec());
@@ -125,26 +125,26 @@ fn camera_corrections_match_differences() {
         });
         assert!(report.unwrap().comparisons > 60);
     }
-    // Where on its line a ray begins has no gradient.
+    // The gradient of the origins along their rays is 0.
     let tape = Tape::new();
     let bound = layout.bind(&tape);
     let (vars, moved) = refine.rays(&bound, &rays, (&FRAMES, &PIXELS), BOX, SPAN);
     let along = tape.constant(Tensor::from_vec(&[8, 3], moved.directions.as_flattened().to_vec()));
     let slid = (&vars.origins * along).sum().grad(&bound.vars());
     assert!(slid.iter().flat_map(|grad| grad.as_slice()).all(|slope| slope.abs() < 1e-12), "{slid:?}");
-    // Every number that should move something does.
+    // All parameters with an effect have a gradient.
     let tape = Tape::new();
     let bound = layout.bind(&tape);
     let (vars, _) = refine.rays(&bound, &rays, (&FRAMES, &PIXELS), BOX, SPAN);
     let grads = seen(&vars).grad(&bound.vars());
     assert!(grads[1].as_slice().iter().all(|slope| slope.abs() > 1e-6), "{:?}", grads[1]);
     let still: Vec<usize> = (0..20).filter(|&i| grads[2].as_slice()[i] == 0.0).collect();
-    // Of a fisheye the last two, of a field of view the last three, of an equirectangular image all.
+    // The last two of a fisheye, the last three of a FOV lens, and all of an equirectangular camera.
     assert_eq!(still, [6, 7, 9, 10, 11, 16, 17, 18, 19]);
 }
 
 #[test]
-fn every_photograph_has_a_balance_of_its_own() {
+fn images_have_their_own_balance() {
     let mut cameras = cameras();
     cameras[3].pose = Camera::look_at(DVec3::new(0.0, 9.0, -1.0), MIDDLE, DVec3::Z);
     for unbounded in [false, true] {
@@ -156,7 +156,7 @@ fn every_photograph_has_a_balance_of_its_own() {
             let expected = balance(camera, extent.bounds, extent.near_far, extent.unit, unbounded);
             assert!(refine.balance[i] == expected && expected != plain(extent.unit), "{i}");
         }
-        // Any of the six moves by about itself what the photograph shows.
+        // Each of the six moves the image by about its own size.
         for k in 0..POSE {
             let id = params.find(POSES).unwrap();
             params.get_mut(id).as_mut_slice().fill(0.0);
@@ -173,7 +173,7 @@ fn every_photograph_has_a_balance_of_its_own() {
 }
 
 #[test]
-fn where_a_lens_puts_nothing_nothing_is_learned() {
+fn unseen_pixels_give_cameras_no_gradient() {
     let mut cameras = cameras();
     cameras.truncate(1);
     cameras[0].lens = Lens::Brown { k: [-0.5, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
@@ -195,14 +195,14 @@ fn where_a_lens_puts_nothing_nothing_is_learned() {
 }
 
 #[test]
-fn cameras_have_to_be_known_where_they_are_corrected() {
+fn camera_optimizer_checks_its_cameras() {
     let new = |poses, config: &CameraOptimizerConfig, frames, cameras: &[Camera]| {
         CameraOptimizer::new(poses, config, (&extent(frames), false), cameras, &mut Params::<f64>::new())
     };
     let cameras = cameras();
     let none = CameraOptimizerConfig::default();
     assert!(new(false, &none, 6, &cameras).unwrap().is_none());
-    // Poses were learned before cameras were stored: by rotation vectors and translations in units of the scene.
+    // Earlier models stored no cameras: their poses are rotation vectors and translations in scene units.
     let plain = new(true, &none, 6, &[]).unwrap().unwrap();
     assert_eq!(numbers(&plain, 5, [0.1, 0.2, 0.3, 1.5, 3.0, -1.5]), [0.1, 0.2, 0.3, 1.0, 2.0, -1.0]);
     let message = |poses, config: &CameraOptimizerConfig, frames, cameras: &[Camera]| {
@@ -228,7 +228,7 @@ fn held_out_cameras_move_with_the_training_cameras() {
     let cameras = cameras();
     let mut params = Params::<f64>::new();
     let refine = CameraOptimizer::new(true, &all(), (&extent(6), false), &cameras, &mut params).unwrap().unwrap();
-    // All move by the same.
+    // All cameras move by the same translation.
     let moved = DVec3::new(0.15, -0.3, 0.45);
     let set = |params: &mut Params<f64>, name: &str, values: &[f64]| {
         let id = params.find(name).unwrap();
@@ -241,10 +241,10 @@ fn held_out_cameras_move_with_the_training_cameras() {
     set(&mut params, "poses", &moves(&refine));
     set(&mut params, "focal", &[0.1, 0.2]);
     set(&mut params, "lens", &[0.01]);
-    // They were given in a line, about which anything could turn if it were for their places alone.
+    // The cameras are on a line, so positions alone would leave a rotation about it open.
     let line = refine.transform(&params).unwrap();
     assert!((line.scale - 0.15_f64.exp()).abs() < 1e-9 && line.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "{line:?}");
-    // And takes each to where it was found.
+    // The similarity maps each camera to its refined pose.
     for (i, camera) in cameras.iter().enumerate() {
         let (all, own) = (line.camera(camera).pose, refine.camera(&params, i, camera).pose);
         assert!(all.abs_diff_eq(own, 1e-9), "{i}: {all:?} {own:?}");
@@ -254,21 +254,21 @@ fn held_out_cameras_move_with_the_training_cameras() {
     let mut params = Params::<f64>::new();
     let refine = CameraOptimizer::new(true, &all(), (&extent(6), false), &around, &mut params).unwrap().unwrap();
     set(&mut params, "poses", &moves(&refine));
-    // Each group has a factor of its own: that of the pinhole, the fourth, is .2 and .4.
+    // Each group has its own factors: those of the pinhole, the fourth group, are 0.2 and 0.4.
     let each: Vec<f64> = (0..10).map(|i| [0.05, 0.1][i % 2] * (i / 2 + 1) as f64).collect();
     set(&mut params, "focal", &each);
     set(&mut params, "lens", &[0.01, 0.02, 0.03, 0.04]);
     let pose = Camera::look_at(DVec3::new(0.0, 4.0, 1.0), DVec3::ZERO, DVec3::Z);
-    // The fifth is a pinhole, and the picture is twice as large.
+    // The fifth camera is a pinhole, and the image is twice as large.
     let other = Camera { pose, ..around[4].resized(18, 14) };
     let found = refine.other_cameras(&params, std::slice::from_ref(&other)).remove(0);
-    // They have stepped back as well, by the mean of the factors of columns and rows.
+    // Its distance grows too, by the mean of the factors of columns and rows.
     let expected = MIDDLE + 0.3_f64.exp() * (pose.translation - MIDDLE) + moved;
     assert!(found.pose.translation.distance(expected) < 1e-9, "{found:?}");
     assert!(found.pose.matrix3.abs_diff_eq(pose.matrix3, 1e-9));
     assert!(((found.focal[0] / 16.0).ln() - 0.2).abs() < 1e-12 && ((found.focal[1] / 17.0).ln() - 0.4).abs() < 1e-12);
     assert!(matches!(found.lens, Lens::Brown { k, p } if k[..3] == [0.01, 0.02, 0.0] && p == [0.03, 0.04]));
-    // Of a camera that took none of the photographs nothing is known.
+    // A camera that took no training image keeps its intrinsics.
     let unknown = Camera { focal: [9.0, 9.0], ..other };
     let found = refine.other_cameras(&params, std::slice::from_ref(&unknown)).remove(0);
     assert_eq!((found.focal, found.lens), (unknown.focal, unknown.lens));

@@ -2,9 +2,9 @@
 
 use super::lattice::{CELLS, EDGE, Lattice, cell};
 
-/// For each axis how far apart the bits of neighbouring cells are.
+/// For each axis, the distance between the bits of neighbouring cells.
 const STRIDES: [usize; 3] = [1, EDGE, EDGE * EDGE];
-/// For each axis the bits of the cells at the lower face of a block.
+/// For each axis, the bits of the cells at the lower face of a block.
 const LOWER: [u64; 3] = [0x1111_1111_1111_1111, 0x000f_000f_000f_000f, 0x0000_0000_0000_ffff];
 
 /// Adds the cells that touch a set's cells by a face, an edge or a corner, within each cascade and from each cascade to
@@ -24,7 +24,7 @@ fn dilate_axis(words: &mut [u64], side: usize, axis: usize) {
     let (shift, far, lower) = (STRIDES[axis], (EDGE - 1) * STRIDES[axis], LOWER[axis]);
     let upper = lower << far;
     let stride = side.pow(axis as u32);
-    // Rows of blocks along the axis: each word needs its neighbours as they were.
+    // Rows of blocks along the axis. Each word needs the old values of its neighbours.
     for start in (0..words.len()).filter(|start| (start / stride).is_multiple_of(side)) {
         let mut before = 0;
         for i in 0..side {
@@ -37,9 +37,9 @@ fn dilate_axis(words: &mut [u64], side: usize, axis: usize) {
     }
 }
 
-/// Adds to the inner part of each cascade the cells in which a smaller cascade has any.
+/// Adds to the inner part of each cascade the cells that contain any cell of a smaller cascade.
 ///
-/// Nothing looks up a single cell there, but a block without any is then empty in all cascades.
+/// No lookup reads a single cell there, but an empty block is then empty in all cascades.
 pub(super) fn coarsen(words: &mut [u64], lattice: &Lattice) {
     let (side, quarter) = (lattice.side(), lattice.side() / 4);
     for cascade in 1..lattice.cascades {
@@ -60,7 +60,7 @@ pub(super) fn coarsen(words: &mut [u64], lattice: &Lattice) {
     }
 }
 
-/// Number of cells that are looked at and set.
+/// The number of set cells that are in use.
 pub(super) fn count(words: &[u64], lattice: &Lattice) -> usize {
     let used = words.iter().enumerate().filter(|(i, _)| lattice.is_used(*i));
     used.map(|(_, word)| word.count_ones() as usize).sum()

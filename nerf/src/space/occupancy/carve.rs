@@ -19,7 +19,7 @@ impl OccupancyGrid {
             for (word, densities) in densities.chunks_exact_mut(CELLS).enumerate() {
                 let [corner, size] = lattice.block(task * TASK + word);
                 let mut left = uncarved(densities);
-                // Most blocks are empty as a whole.
+                // Most blocks are entirely empty.
                 if left != 0 && is_empty(corner + 2.0 * size, 2.0 * size.length()) {
                     densities.fill(CARVED);
                     left = 0;

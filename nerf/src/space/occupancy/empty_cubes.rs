@@ -3,11 +3,12 @@
 use super::lattice::Lattice;
 use raygrad_tensor::parallel;
 
-/// For each block and each of the eight octants of directions, the edge in blocks of the largest empty cube that has
-/// the block in its rearmost corner: a ray in one of the cube's blocks is next tested where it leaves the cube.
+/// For each block and each of the eight octants of directions, the edge of an empty cube in blocks. It is the largest
+/// cube that has the block in its rearmost corner. A ray in one of the cube's blocks is next tested where it leaves the
+/// cube.
 ///
-/// 0 is a block with an occupied cell. A cube ends at the border of its cascade, but that of the outermost cascade may
-/// reach beyond it, where nothing is.
+/// 0 is a block with an occupied cell. A cube ends at the border of its cascade. That of the outermost cascade may
+/// extend beyond it, where nothing is.
 #[derive(Debug, Clone)]
 pub(super) struct Leaps {
     tables: [Vec<u8>; 8],

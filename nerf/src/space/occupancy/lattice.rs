@@ -11,9 +11,9 @@ const _: () = assert!(EDGE * EDGE * EDGE == CELLS);
 
 /// The geometry of a grid, without its content.
 ///
-/// Cascade 0 is the box itself; each further cascade is a box twice as large around the same centre with as many cells.
-/// A point belongs to the smallest cascade that holds it. Blocks are numbered x fastest, then y, z and cascade; bit
-/// `x + 4 y + 16 z` of a block's word is its cell `(x, y, z)`.
+/// Cascade 0 is the box itself. Each further cascade is a box twice as large around the same centre, with as many
+/// cells. A point belongs to the smallest cascade that contains it. Blocks are numbered x fastest, then y, z and
+/// cascade; bit `x + 4 y + 16 z` of a block's word is its cell `(x, y, z)`.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Lattice {
     pub bounds: [DVec3; 2],
@@ -98,12 +98,12 @@ impl Lattice {
     }
 }
 
-/// The place of a cell in its block.
+/// The position of a cell in its block.
 pub(super) fn cell(bit: usize) -> [usize; 3] {
     [bit % EDGE, bit / EDGE % EDGE, bit / (EDGE * EDGE)]
 }
 
-/// The density of a cell that is empty for good: below any threshold, and never looked at.
+/// The density of a carved cell: below any threshold, and never sampled.
 pub(super) const CARVED: f32 = f32::NEG_INFINITY;
 
 /// The cells of a block that are not carved.

@@ -26,7 +26,7 @@ pub struct MarchBuffer {
     pub offsets: Vec<u32>,
     /// Number of samples if every cell were occupied, to measure skipping against.
     pub steps: u64,
-    /// `growth[i] = ((1 + c)^i - 1) / c` for the cone `c` of the last call that had one.
+    /// `growth[i] = ((1 + c)^i - 1) / c` for the last cone `c` above 0.
     growth: Vec<f32>,
     cone: f32,
 }
@@ -73,7 +73,7 @@ impl OccupancyGrid {
             out.cone = step.cone;
         }
         let mut found = Found { t: std::mem::take(&mut out.t), delta: std::mem::take(&mut out.delta), len: 0 };
-        // As long as each other, should the caller have changed one.
+        // Equal lengths, in case the caller changed one.
         found.delta.resize(found.t.len(), 0.0);
         simd::dispatch(
             #[inline(always)]
@@ -107,7 +107,7 @@ impl OccupancyGrid {
         (out.t, out.delta) = (found.t, found.delta);
     }
 
-    /// Adds one ray's samples and returns how many it would have if every cell were occupied.
+    /// Adds one ray's samples and returns the number that a fully occupied grid would give.
     #[inline(always)]
     fn march_ray<const NESTED: bool>(
         &self,
@@ -127,7 +127,7 @@ impl OccupancyGrid {
         }
     }
 
-    /// Leaps over empty blocks, and tests samples in groups from those on that are not empty.
+    /// Skips empty blocks, and tests samples in groups from the first block that is not empty.
     #[inline(always)]
     fn walk<S: Spacing, const DELTA: bool, const NESTED: bool>(
         &self,
@@ -161,7 +161,8 @@ impl OccupancyGrid {
         (end - first) as u64
     }
 
-    /// Which of the samples at these distances lie in occupied cells, one bit for each; any, beyond the box.
+    /// A bit for each of the samples at these distances, set if its cell is occupied. Beyond the box bits are
+    /// arbitrary.
     #[inline(always)]
     fn test<const NESTED: bool>(
         &self,
@@ -184,13 +185,13 @@ impl OccupancyGrid {
     }
 }
 
-/// A bit for each of the first `count` lanes, or for all.
+/// A bit for each of the first `count` lanes, at most all.
 #[inline(always)]
 fn first_lanes(count: usize) -> u32 {
     (1 << count.min(LANES)) - 1
 }
 
-/// The first sample and the one after the last that are before `far` and in the box.
+/// The range of the samples that are before `far` and in the box.
 #[inline(always)]
 fn inside<S: Spacing>(frame: &Frame, ray: &LatticeRay, spacing: &S) -> (usize, usize) {
     let far = ray.span[1];
@@ -211,13 +212,13 @@ fn inside<S: Spacing>(frame: &Frame, ray: &LatticeRay, spacing: &S) -> (usize, u
     (first, end)
 }
 
-/// The first sample after sample `i` that is beyond one of the upper `faces` of a box that holds sample `i`; at most
-/// `end`. In rare cases of rounding an earlier one, which is in the box too.
+/// The first sample after sample `i` beyond one of the upper `faces` of a box that contains sample `i`; at most `end`.
+/// Rounding may give an earlier one, which is also in the box.
 #[inline(always)]
 fn first_beyond<S: Spacing>(ray: &LatticeRay, spacing: &S, faces: [f32; 3], i: usize, end: usize) -> usize {
     let leave = ray.reaches(faces);
     let mut next = (spacing.steps_to(leave[0].min(leave[1]).min(leave[2]))).clamp(i + 1, end);
-    // No coordinate falls along the ray: if the last sample before `next` is in the box, then all between are.
+    // No coordinate falls along the ray: if the last sample before `next` is in the box, all between are.
     loop {
         let last = ray.at(spacing.at(next - 1));
         if next == i + 1 || last[0] < faces[0] && last[1] < faces[1] && last[2] < faces[2] {
@@ -227,7 +228,7 @@ fn first_beyond<S: Spacing>(ray: &LatticeRay, spacing: &S, faces: [f32; 3], i: u
     }
 }
 
-/// Samples so far: the first `len` elements, of more that are there to be overwritten.
+/// The samples so far: the first `len` elements; later ones are overwritten.
 struct Found {
     t: Vec<f32>,
     delta: Vec<f32>,
@@ -235,7 +236,7 @@ struct Found {
 }
 
 impl Found {
-    /// Adds those of a group of samples that have their bit set.
+    /// Adds the samples of a group whose bits are set.
     #[inline(always)]
     fn add<S: Spacing, const DELTA: bool>(&mut self, spacing: &S, group: usize, mut set: u32) {
         if self.t.len() < self.len + 2 * LANES {
@@ -245,8 +246,8 @@ impl Found {
                 self.delta.resize(room, 0.0);
             }
         }
-        // Samples in a row, of which there are few in a group, are written as a whole group from the first one on: what
-        // follows them is overwritten by the next ones.
+        // A group has few runs of set bits. Each run is written as a whole group from its first sample, and the next
+        // one overwrites the excess.
         while set != 0 {
             let (skipped, count) = (set.trailing_zeros(), (set >> set.trailing_zeros()).trailing_ones());
             let first = group + skipped as usize;

@@ -67,12 +67,12 @@ pub use march::{MAX_STEPS, MarchBuffer, Step};
 pub use skip::{Skip, Skipping};
 pub use update::{DensityFn, POINTS, Update};
 
-/// Cells of a grid, at most.
+/// The most cells of a grid.
 const MOST_CELLS: usize = 1 << 30;
-/// A density, and a bit.
+/// A density and a bit.
 const BYTES_PER_CELL: f64 = 4.125;
 
-/// Words that one task works on.
+/// Words per task.
 const TASK: usize = 256;
 
 /// Configuration of an [`OccupancyGrid`].
@@ -103,7 +103,7 @@ struct Stored {
     resolution: usize,
     cascades: usize,
     skip: Skipping,
-    /// Switch for visual hull carving. true becomes a `carving` of 1, false one of 0.
+    /// The former switch for visual hull carving: true becomes a `carving` of 1, false becomes 0.
     silhouettes: Option<bool>,
 }
 
@@ -132,7 +132,8 @@ impl OccupancyConfig {
         if !(1..=8).contains(&self.cascades) {
             return Err(Error::setting("occupancy.cascades", format!("is {}; use 1 to 8", self.cascades)));
         }
-        // With several, the border of the next smaller cascade must not cut a block: it lies at a quarter of the blocks.
+        // With several cascades, the border of the next smaller one lies at a quarter of the blocks and must not cut a
+        // block.
         let unit = if self.cascades > 1 { 16 } else { 4 };
         if !self.resolution.is_multiple_of(unit) || !(unit..=1024).contains(&self.resolution) {
             let what = format!("is {}; use a multiple of {unit} up to 1024", self.resolution);
@@ -171,8 +172,8 @@ pub struct Threshold {
 #[derive(Debug, Clone)]
 pub struct OccupancyGrid {
     lattice: Lattice,
-    /// For each cell, in the order of the words and their bits, the decayed largest density, as many times over as the
-    /// cell is larger than those of cascade 0; NaN if never looked at. Shared with copies until one of them looks.
+    /// For each cell, in the order of words and bits, the decayed largest density times the cell's size relative to
+    /// cascade 0; NaN if never sampled. Copies share it until one of them samples.
     densities: Arc<Vec<f32>>,
     /// For each block its occupied cells; see [`bits::coarsen`] for the inner blocks of larger cascades.
     words: Vec<u64>,
@@ -255,7 +256,7 @@ impl OccupancyGrid {
     ///
     /// Densities are multiplied by the cell's size relative to the first cascade. Carved cells do not count.
     pub fn mean_density(&self) -> f64 {
-        // In tasks of fixed size, so that the sum has the same bits at any number of threads.
+        // Tasks of fixed size, so that the sum has the same bits at any number of threads.
         let parts: Vec<&[f32]> = self.densities.chunks(CELLS * TASK).collect();
         let sums = parallel::collect(parts.len(), |i| {
             let known = parts[i].iter().filter(|x| !x.is_nan() && **x != CARVED);
@@ -269,7 +270,7 @@ impl OccupancyGrid {
     pub fn threshold(&mut self, rule: &Threshold) {
         let mut limit = rule.min_sigma;
         if rule.or_mean {
-            // The mean itself is not passed over: it may be that of a fog that is the same everywhere.
+            // The mean itself is occupied: in a uniform fog every cell has it.
             let mean = self.mean_density() as f32;
             limit = limit.min(if mean > 0.0 { mean.next_down() } else { mean });
         }
@@ -294,7 +295,7 @@ impl OccupancyGrid {
         words
     }
 
-    /// Makes these cells the occupied ones.
+    /// Sets the occupied cells.
     fn occupy(&mut self, mut words: Vec<u64>, dilate: bool) {
         if dilate {
             bits::dilate(&mut words, &self.lattice);

@@ -74,7 +74,7 @@ pub struct Skipping {
     pub colors: f64,
 }
 
-/// Images that must agree that a cell is empty.
+/// The number of images that must agree that a cell is empty.
 const VOTES: u32 = 3;
 
 impl From<Skip> for Skipping {
@@ -145,7 +145,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn switches_are_a_name_or_each_for_itself() {
+    fn skipping_is_read_from_a_name_or_fields() {
         let read = |text: &str| serde_json::from_str::<Skipping>(text);
         for skip in [Skip::Off, Skip::NearLossless, Skip::Fast] {
             let switches = Skipping::from(skip);

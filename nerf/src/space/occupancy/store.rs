@@ -7,7 +7,7 @@ use crate::{Error, Result};
 use glam::DVec3;
 use std::sync::Arc;
 
-/// What a stored grid begins with, a name and a version: with the densities of its cells, and without.
+/// The magic bytes of a stored grid, a name and a version: with the densities of its cells, and without.
 const WHOLE: [u8; 8] = *b"raygocc1";
 const OCCUPIED: [u8; 8] = *b"raygocb1";
 /// Bytes before the words: magic, resolution and cascades (u32), lower and upper corner (f64).
@@ -57,7 +57,7 @@ impl OccupancyGrid {
         let [resolution, cascades] = [0; 2].map(|_| u32::from_le_bytes(take(&mut rest)) as usize);
         let corners = [[0; 3]; 2].map(|corner| DVec3::from(corner.map(|_| f64::from_le_bytes(take(&mut rest)))));
         let config = OccupancyConfig { resolution, cascades, ..OccupancyConfig::default() };
-        // Before anything is allocated for it.
+        // Checked before memory is allocated for it.
         config.check()?;
         let cells = resolution.pow(3) * cascades;
         let needed = HEADER + cells / CELLS * 8 + if is_whole { cells * 4 } else { 0 };
@@ -82,7 +82,7 @@ impl OccupancyGrid {
     }
 }
 
-/// Takes the first `N` bytes off a slice that holds as many.
+/// Takes the first `N` bytes off a slice, which must have as many.
 fn take<const N: usize>(bytes: &mut &[u8]) -> [u8; N] {
     let mut out = [0; N];
     let (head, rest) = bytes.split_at(N);

@@ -1,4 +1,4 @@
-//! Bits against sets of cells, updates against their rules, skipping against its bounds.
+//! Bit operations compared with sets of cells, updates with their rules, and skipping with its error bound.
 
 use super::*;
 use crate::random::Jitter;
@@ -17,20 +17,20 @@ fn grid(resolution: usize, cascades: usize) -> OccupancyGrid {
     OccupancyGrid::new(BOX, &OccupancyConfig { resolution, cascades, ..OccupancyConfig::default() }).unwrap()
 }
 
-/// The place in its cascade of a bit of a word.
+/// The cell of a bit of a word, in its cascade.
 fn place(lattice: &Lattice, word: usize, bit: usize) -> [usize; 3] {
     let (_, block) = lattice.place(word);
     let cell = lattice::cell(bit);
     [0, 1, 2].map(|axis| block[axis] * 4 + cell[axis])
 }
 
-/// The cells of cascade 0 that are set.
+/// The set cells of cascade 0.
 fn set(words: &[u64], lattice: &Lattice) -> BTreeSet<[usize; 3]> {
     let all = (0..lattice.blocks()).flat_map(|word| (0..CELLS).map(move |bit| (word, bit)));
     all.filter(|(word, bit)| words[*word] >> bit & 1 == 1).map(|(word, bit)| place(lattice, word, bit)).collect()
 }
 
-/// Random cells, few enough that not everything is occupied.
+/// Random cells, few enough that not all are occupied after dilation.
 fn random_words(lattice: &Lattice, share: f64, seed: u64) -> Vec<u64> {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     (0..lattice.words())
@@ -49,7 +49,7 @@ fn balls(points: &[[f32; 3]], out: &mut [f32]) {
 
 proptest! {
     #[test]
-    fn dilation_as_by_neighbours(seed in 0..1000u64, share in 0.0..0.02f64, side in 1..5usize) {
+    fn dilation_equals_neighbour_sets(seed in 0..1000u64, share in 0.0..0.02f64, side in 1..5usize) {
         let lattice = Lattice { bounds: BOX, resolution: 4 * side, cascades: 1 };
         let words = random_words(&lattice, share, seed);
         let mut expected = BTreeSet::new();
@@ -68,7 +68,7 @@ proptest! {
     }
 
     #[test]
-    fn the_share_is_as_by_cells(seed in 0..1000u64, share in 0.0..0.005f64) {
+    fn occupied_share_equals_cell_count(seed in 0..1000u64, share in 0.0..0.005f64) {
         let mut grid = grid(16, 1);
         let words = random_words(&grid.lattice, share, seed);
         let cells = set(&words, &grid.lattice);
@@ -77,7 +77,7 @@ proptest! {
     }
 
     #[test]
-    fn leaps_as_by_growing_cubes(seed in 0..1000u64, share in 0.0..0.002f64, octant in 0..8usize) {
+    fn leaps_equal_growing_cubes(seed in 0..1000u64, share in 0.0..0.002f64, octant in 0..8usize) {
         let lattice = Lattice { bounds: BOX, resolution: 20, cascades: 1 };
         let words = random_words(&lattice, share, seed);
         let leaps = Leaps::new(&words, &lattice);
@@ -97,7 +97,7 @@ proptest! {
 }
 
 #[test]
-fn coarser_cascades_hold_what_finer_ones_do() {
+fn coarsen_covers_finer_cascades() {
     let lattice = Lattice { bounds: BOX, resolution: 32, cascades: 3 };
     let mut words: Vec<u64> = random_words(&lattice, 0.001, 4);
     words[lattice.cascade(1).start..].fill(0);
@@ -132,15 +132,15 @@ fn cascade_thresholds_halve_each_time() {
                 "{sigma} {cascade}"
             );
         }
-        // The depth of a fog that is just not seen, through all boxes from corner to corner: 1 times the first's diagonal,
-        // and half as dense in half of the second's beyond it, and so on.
+        // The least visible fog, through all boxes from corner to corner. The first box contributes its diagonal. Each
+        // further one has half the density in the half of its diagonal that is beyond the box before.
         let [low, high] = grid.bounds();
         assert!(grid.longest_path() >= (1.0 + 0.5 * 1.0 + 0.25 * 2.0) * low.distance(high));
     }
 }
 
 #[test]
-fn cells_tile_the_boxes() {
+fn lattice_cells_tile_the_boxes() {
     let lattice = Lattice { bounds: BOX, resolution: 16, cascades: 2 };
     let [low, high] = lattice.extent(1);
     assert_eq!((low, high), (DVec3::new(-2.0, -2.5, -3.0), DVec3::new(2.0, 3.5, 5.0)));
@@ -184,11 +184,11 @@ fn updates_decay_and_take_the_larger() {
 }
 
 #[test]
-fn samples_lie_in_their_cells() {
+fn update_samples_lie_in_their_cells() {
     let mut grid = grid(16, 3);
     let outside = Mutex::new(0);
     let (low, high) = (grid.outer_bounds()[0].as_vec3() - 1e-5, grid.outer_bounds()[1].as_vec3() + 1e-5);
-    // The density names the place: after one look a cell's density must be that of a point within it.
+    // The density encodes the position: after one sample, a cell's density must be that of a point within it.
     let density = |points: &[[f32; 3]], out: &mut [f32]| {
         for (p, out) in points.iter().zip(out) {
             *outside.lock().unwrap() += usize::from((0..3).any(|a| !(low[a]..=high[a]).contains(&p[a])));
@@ -231,7 +231,7 @@ fn partial_updates_visit_every_cell_once_in_a_round() {
 }
 
 #[test]
-fn same_bits_at_any_number_of_threads() {
+fn updates_have_the_same_bits_on_any_threads() {
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
@@ -250,7 +250,7 @@ fn same_bits_at_any_number_of_threads() {
 }
 
 #[test]
-fn rebuild_finds_what_eight_samples_a_cell_find() {
+fn rebuild_equals_eight_samples_per_cell() {
     for (cascades, dilate) in [(1, false), (1, true), (2, true)] {
         let mut grid = grid(32, cascades);
         let mut calls = 0;
@@ -281,7 +281,7 @@ fn rebuild_finds_what_eight_samples_a_cell_find() {
 #[test]
 fn pruning_empties_faint_cells_and_fills_none() {
     let mut grid = grid(32, 1);
-    // Half of the box; no field is asked elsewhere.
+    // Half of the box; the field is not evaluated elsewhere.
     grid.carve(&|centre, radius| centre.x + radius < 0.0);
     grid.occupy_all_but_carved();
     let before = set(&grid.words, &grid.lattice);
@@ -294,7 +294,7 @@ fn pruning_empties_faint_cells_and_fills_none() {
     });
     let after = set(&grid.words, &grid.lattice);
     assert!(after.is_subset(&before) && after.len() > 20 && after.len() < before.len() / 10, "{}", after.len());
-    // Eight places in each cell, and 64 more in those that go.
+    // Eight points per cell, and 64 more in emptied ones.
     let most = 72 * before.len() - 64 * after.len();
     let asked = asked.into_inner().unwrap() as usize;
     assert!((most..most + 64 * after.len()).contains(&asked), "{asked}, {most}");
@@ -316,7 +316,7 @@ fn pruning_keeps_a_sheet_between_octant_centres() {
 }
 
 #[test]
-fn carved_cells_are_never_looked_at_and_stay_empty() {
+fn carved_cells_are_never_sampled_and_stay_empty() {
     let mut grid = grid(16, 1);
     grid.carve(&|centre, _| centre.y < 0.5);
     let everywhere = |points: &[[f32; 3]], out: &mut [f32]| {
@@ -330,7 +330,7 @@ fn carved_cells_are_never_looked_at_and_stay_empty() {
 }
 
 #[test]
-fn grids_survive_being_stored() {
+fn occupancy_grid_round_trips() {
     let mut stored = grid(16, 2);
     stored.update(&Update { every: 2, ..Update::ALL }, 0, 0, &balls);
     stored.threshold(&Threshold { min_sigma: 0.1, or_mean: false, dilate: true });
@@ -338,7 +338,7 @@ fn grids_survive_being_stored() {
     let read = OccupancyGrid::from_bytes(&bytes).unwrap();
     assert_eq!((read.to_bytes() == bytes, &read.words, &read.lattice), (true, &stored.words, &stored.lattice));
     let message = |bytes: &[u8]| OccupancyGrid::from_bytes(bytes).unwrap_err().to_string();
-    // What views read alone: a bit for each cell.
+    // Renders need a bit per cell alone.
     let occupied = stored.occupied_to_bytes();
     assert_eq!(occupied.len(), 64 + 2 * 16 * 16 * 16 / 8);
     let seen = OccupancyGrid::from_bytes(&occupied).unwrap();
@@ -370,7 +370,7 @@ fn grids_survive_being_stored() {
 }
 
 #[test]
-fn settings_out_of_range_are_refused() {
+fn occupancy_settings_out_of_range_are_errors() {
     let check = |resolution, cascades| OccupancyConfig { resolution, cascades, skip: Skip::Off.into() }.check();
     assert!(check(4, 1).is_ok() && check(12, 1).is_ok() && check(1024, 1).is_ok() && check(512, 8).is_ok());
     for (resolution, cascades) in
@@ -385,7 +385,7 @@ fn settings_out_of_range_are_refused() {
     assert!("slow".parse::<Skip>().unwrap_err().to_string().contains("off, near-lossless or fast"));
 }
 
-/// Colours of rays from all sides: samples at all steps, and at those that the grid leaves.
+/// Colours of rays from all sides, and the number of samples: with the grid's samples.
 fn render(grid: &OccupancyGrid, density: &DensityFn<'_>) -> (Vec<f32>, u64) {
     let mut rays = Rays::new();
     let mut rng = Pcg64Mcg::seed_from_u64(5);
@@ -410,9 +410,9 @@ fn render(grid: &OccupancyGrid, density: &DensityFn<'_>) -> (Vec<f32>, u64) {
     (pairs.map(|(color, left)| color + left).collect(), samples.len() as u64)
 }
 
-/// docs/library/numerics.md, "Skipping": fog everywhere, above and just below what may be skipped, with balls in it.
+/// docs/library/numerics.md, "Skipping": uniform fog with balls in it, above and just below the skipped density.
 #[test]
-fn skipping_costs_no_more_than_its_bound() {
+fn skipping_error_is_within_its_bound() {
     let all = grid(32, 1);
     for skip in [Skip::NearLossless, Skip::Fast] {
         let min_sigma = skip.min_sigma(all.longest_path());

@@ -45,31 +45,31 @@ impl Update {
     pub const PARTIAL: Update = Update { every: 16, ..Update::ALL };
 }
 
-/// Where the samples of a cell lie, as shares of its edges: in each of the boxes with these lower corners and of this
-/// size, at a random place; a size of 0 is a fixed place.
+/// Sample positions in a cell, as shares of its edges: a random point in each of the boxes with these lower corners and
+/// this size. A size of 0 gives fixed points.
 struct Places {
     corners: Vec<[f64; 3]>,
     size: f64,
 }
 
 impl Places {
-    /// One in each of `n` x `n` x `n` parts.
+    /// A random point in each of `n` x `n` x `n` parts.
     fn random(n: usize) -> Self {
         Places { corners: parts(n, 0.0), size: 1.0 / n as f64 }
     }
 
-    /// The middle of each of `n` x `n` x `n` parts.
+    /// The centre of each of `n` x `n` x `n` parts.
     fn middles(n: usize) -> Self {
         Places { corners: parts(n, 0.5), size: 0.0 }
     }
 }
 
-/// The points `shift` behind the lower corners of `n` x `n` x `n` parts, in parts.
+/// The points `shift` parts from the lower corners of `n` x `n` x `n` parts.
 fn parts(n: usize, shift: f64) -> Vec<[f64; 3]> {
     (0..n * n * n).map(|i| [i % n, i / n % n, i / (n * n)].map(|k| (k as f64 + shift) / n as f64)).collect()
 }
 
-/// Positions that wait to be looked at, and the cells that they belong to.
+/// Positions to sample, and their cells.
 #[derive(Default)]
 struct Waiting {
     cells: Vec<usize>,
@@ -78,8 +78,8 @@ struct Waiting {
 }
 
 impl Waiting {
-    /// Looks at what waits; `scale` is what the densities of a word's cells are multiplied by, and `keep` makes a
-    /// cell's density of its old one and the largest new one.
+    /// Samples the waiting positions. `scale` is the factor of the densities of a word's cells. `keep` combines a
+    /// cell's old density and the largest new one.
     fn flush(
         &mut self,
         density: &DensityFn<'_>,
@@ -108,9 +108,9 @@ fn larger(old: f32, new: f32) -> f32 {
     if new <= old || old.is_nan() { old } else { new }
 }
 
-/// The cells of word `word` whose turn it is if every cell has one turn in `every` steps.
+/// The cells of word `word` that have their turn, if every cell has one turn in `every` steps.
 fn turn(word: usize, step: u64, every: u32) -> u64 {
-    // Neighbouring words begin their rounds at unrelated cells (multiples of the golden ratio).
+    // Neighbouring words start their rounds at unrelated cells (multiples of the golden ratio).
     let start = (word as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40;
     let every = u64::from(every.max(1));
     let first = (start + step) % every;
@@ -133,7 +133,7 @@ impl OccupancyGrid {
         let words = std::mem::take(&mut self.words);
         let chosen = |word: usize| turn(word, step, plan.every) | words[word] & turn(word, step, plan.occupied_every);
         let rng = |task: usize| stream(seed, [step, task as u64]);
-        // The field's NaN replaces what was known.
+        // A NaN of the field replaces the known density.
         let keep = |old: f32, new: f32| if new <= plan.decay * old { plan.decay * old } else { new };
         let count = self.look(&Places::random(plan.samples as usize), chosen, rng, keep, density);
         self.words = words;
@@ -152,7 +152,7 @@ impl OccupancyGrid {
     pub fn rebuild(&mut self, min_sigma: f32, dilate: bool, density: &DensityFn<'_>) -> u64 {
         let all = Places::middles(REBUILD);
         let one = Places { corners: all.corners[..1].to_vec(), ..all };
-        // Fixed places draw nothing.
+        // Fixed points draw no random numbers.
         let rng = |_| stream(0, [0, 0]);
         let mut count = self.look(&one, |_| u64::MAX, rng, |_, new| new, density);
         let mut occupied = self.exceeding(min_sigma);
@@ -205,7 +205,7 @@ impl OccupancyGrid {
         count
     }
 
-    /// Looks at the chosen cells of each word.
+    /// Samples the chosen cells of each word.
     fn look(
         &mut self,
         places: &Places,
@@ -222,7 +222,7 @@ impl OccupancyGrid {
     }
 }
 
-/// What `f` counts in the parts, together; parallel over them, with scratch space.
+/// The sum of `f` over the parts, in parallel, with scratch space.
 fn counted<P: Send, S: Default + Send>(
     parts: impl Iterator<Item = P>,
     f: impl Fn(&mut S, usize, P) -> u64 + Sync,
@@ -235,7 +235,7 @@ fn counted<P: Send, S: Default + Send>(
     count.into_inner()
 }
 
-/// What is looked at, and where in a cell.
+/// The field, and the sample positions in a cell.
 struct Look<'a> {
     lattice: &'a Lattice,
     places: &'a Places,
@@ -243,8 +243,8 @@ struct Look<'a> {
 }
 
 impl Look<'_> {
-    /// Looks at the chosen cells of each word of a task, whose densities these are, and returns how many densities were
-    /// asked for.
+    /// Samples the chosen cells of each word of a task, whose densities are `densities`, and returns the number of
+    /// evaluations.
     fn at(
         &self,
         task: usize,

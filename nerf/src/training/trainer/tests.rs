@@ -27,10 +27,10 @@ fn cameras_without_view_of_the_box_are_an_error() {
     let message = Trainer::new(tiny(), Arc::new(data.clone())).err().unwrap().to_string();
     let expected = "no ray of the 3 images meets the box";
     assert!(message.contains(expected) && message.contains("on average"), "{message}");
-    // One that sees a part is enough.
+    // One camera that sees a part is enough.
     data.frames[2].camera.pose.translation /= 3.0;
     Trainer::new(tiny(), Arc::new(data.clone())).unwrap();
-    // Near enough, and looking away.
+    // Near enough, but looking away.
     data.frames.drain(..2);
     data.frames[0].camera.pose.matrix3 = -data.frames[0].camera.pose.matrix3;
     assert!(data.check_reach(data.bounds).is_err());
@@ -45,7 +45,7 @@ fn forward_facing_fields_use_ndc() {
     let config = tiny_table().with_scene_type(data.scope);
     let trainer = Trainer::new(config.clone(), Arc::new(data.clone())).unwrap();
     assert_eq!(trainer.model.scene_box.ndc, Some(ndc));
-    // Before its near plane all places of a line from the eye are one, and beside it not.
+    // In front of the near plane, all points of a ray from the eye are equal; without NDC they differ.
     let places = [0.5, 0.9, 1.5].map(|depth| ndc.eye - depth * ndc.near * ndc.axes.z_axis);
     let places = places.map(|place| place.as_vec3().to_array());
     let densities = |trainer: &Trainer| {
@@ -66,7 +66,7 @@ fn forward_facing_fields_use_ndc() {
     };
     assert!(refused(&tiny_table(), &data).contains("`unbounded`"));
     assert!(refused(&config, &Dataset { ndc: None, ..data.clone() }).contains("Ndc::around"));
-    // The rest of its state goes with it.
+    // The state resumes NDC scenes too.
     let mut trainer = trainer;
     trainer.step(0.0);
     let state = trainer.state().unwrap();
@@ -100,14 +100,14 @@ fn step_stats_add_up_and_name_the_failing_step() {
     };
     let [first, second, third] = [(); 3].map(|()| counts(&mut trainer));
     for i in 0..6 {
-        // A step is not much larger than another.
+        // Steps have similar counts.
         let [a, b, c] = [first[i], second[i] - first[i], third[i] - second[i]].map(|count| count as f64);
         assert!(a > 0.0 && (0.5..2.0).contains(&(b / a)) && (0.5..2.0).contains(&(c / b)), "{i}: {a} {b} {c}");
     }
 }
 
 #[test]
-fn the_last_tile_of_a_step_has_the_rays_that_are_left() {
+fn last_tile_has_the_remaining_rays() {
     let mut data = ball(Split::Train, 8);
     data.frames.truncate(2);
     let data = Arc::new(data);
@@ -120,12 +120,12 @@ fn the_last_tile_of_a_step_has_the_rays_that_are_left() {
         stats.placed_samples
     };
     assert!(marched(8) > 0);
-    // Every ray takes as many steps; tiles are of eight.
+    // Every ray has the same number of samples; tiles have eight rays.
     assert_eq!(8 * marched(21), 21 * marched(8));
 }
 
 #[test]
-fn a_restart_keeps_what_was_said_of_parameters() {
+fn restart_keeps_frozen_values_and_lr_scales() {
     let mut data = ball(Split::Train, 8);
     data.frames.truncate(2);
     let mut trainer = Trainer::new(tiny(), Arc::new(data)).unwrap();
@@ -145,7 +145,7 @@ fn a_restart_keeps_what_was_said_of_parameters() {
 }
 
 #[test]
-fn a_restart_knows_the_cameras_that_it_corrects() {
+fn restart_resets_refined_cameras() {
     let mut data = ball(Split::Train, 8);
     data.frames.truncate(3);
     let config = tiny().with_refined(&[RefinedParam::Poses, RefinedParam::Focal, RefinedParam::Exposure]);
@@ -155,7 +155,7 @@ fn a_restart_knows_the_cameras_that_it_corrects() {
     let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
     assert_eq!(trainer.model.cameras(), cameras);
     assert!(trainer.model.exposure.is_some() && trainer.model.camera_optimizer.is_some());
-    // They are as they were given, and move on.
+    // The cameras start as given and are refined again.
     let moved = |trainer: &Trainer| trainer.model.learned_camera(1, &cameras[1]) != cameras[1];
     assert!(!moved(&trainer));
     let before = trainer.stats().step;
@@ -165,7 +165,7 @@ fn a_restart_knows_the_cameras_that_it_corrects() {
     assert!(trainer.stats().step == before + 3 && moved(&trainer));
 }
 
-/// Two tiny networks, and few rays of few samples.
+/// Two tiny networks, with few rays of few samples.
 fn tiny() -> Config {
     let paper = ClassicConfig::paper();
     let field = ClassicConfig { depth: 2, width: 16, skip_layers: vec![], view_width: 8, position_levels: 3, ..paper };
@@ -215,7 +215,7 @@ fn frozen_parameters_rest_others_have_own_lr() {
             for ((name, before), after) in before.iter().zip(trainer.model.params.values()) {
                 assert_eq!(before == after, rests(name), "{name}, round {round}");
             }
-            // What was frozen is moved again.
+            // Unfrozen parameters change again.
             trainer.model.params.unfreeze(|_| true);
             let before = trainer.model.params.clone();
             trainer.step(0.1);
@@ -243,7 +243,7 @@ fn overflowing_networks_end_the_run() {
 }
 
 #[test]
-fn a_run_that_has_diverged_ends() {
+fn diverged_run_ends() {
     let data = Arc::new(ball(Split::Train, 12));
     for config in [tiny(), tiny_table()] {
         let mut trainer = Trainer::new(config, data.clone()).unwrap();
@@ -258,7 +258,7 @@ fn a_run_that_has_diverged_ends() {
 }
 
 #[test]
-fn what_is_not_finite_first_is_named() {
+fn first_non_finite_names_value_and_line() {
     let data = Arc::new(ball(Split::Train, 12));
     for config in
         [tiny(), tiny_table(), tiny().with_refined(&[RefinedParam::Poses, RefinedParam::Focal, RefinedParam::Exposure])]
@@ -268,7 +268,7 @@ fn what_is_not_finite_first_is_named() {
             assert!(trainer.first_non_finite(0.5).is_none());
             trainer.step(0.5);
         }
-        // What comes of the last weights of the colours.
+        // Values computed from the last weights of the colours.
         let ids: Vec<_> = trainer.model.params.ids().collect();
         let last = ids.into_iter().rfind(|id| trainer.model.params.name(*id).contains("color")).unwrap();
         trainer.model.params.get_mut(last).as_mut_slice()[0] = f32::NAN;
@@ -280,7 +280,7 @@ fn what_is_not_finite_first_is_named() {
 }
 
 #[test]
-fn a_slower_run_moves_less() {
+fn lr_scale_scales_all_updates() {
     let data = Arc::new(ball(Split::Train, 12));
     let config = tiny_table().with_refined(&[RefinedParam::Exposure]);
     let [whole, half, none] = [1.0, 0.5, 0.0].map(|factor| {
@@ -296,7 +296,7 @@ fn a_slower_run_moves_less() {
         (rate, after.zip(before.values()).map(moved).collect::<Vec<f64>>())
     });
     assert!(whole.0 == 2.0 * half.0 && none.0 == 0.0 && whole.1.iter().all(|moved| *moved > 0.0), "{whole:?}");
-    // Adam's first step is the rate.
+    // Adam's first step is the learning rate.
     for ((whole, half), none) in whole.1.iter().zip(&half.1).zip(&none.1) {
         assert!((half / whole - 0.5).abs() < 1e-3 && *none == 0.0, "{whole} {half} {none}");
     }
@@ -310,17 +310,17 @@ fn batch_size_follows_wanted_samples() {
         trainer.adapt_batch(&Work { marched, ..Work::default() });
         trainer.batch
     };
-    // 24576 samples of 8 each are 3072 rays: half of the way there.
+    // 24576 samples of 8 per ray are 3072 rays; the change is half of the difference.
     assert_eq!(next(1024, 8 * 1024), 2048);
     assert_eq!(next(5120, 8 * 5120), 4096);
-    // At most twice as many, whole slots, and within bounds.
+    // At most twice as many, in whole slots, and within bounds.
     assert_eq!([next(1024, 1024), next(1024, 0)], [2048; 2]);
     assert_eq!(next(1500, 8 * 1500), 2288);
     assert_eq!(next(256, 10_000_000), 256);
 }
 
 #[test]
-fn a_restart_draws_other_rays() {
+fn restart_draws_other_rays() {
     let data = Arc::new(ball(Split::Train, 12));
     let [one, other] = [0, 1].map(|restarts| {
         let mut trainer = Trainer::new(tiny_table(), data.clone()).unwrap();
@@ -331,7 +331,7 @@ fn a_restart_draws_other_rays() {
 }
 
 #[test]
-fn settings_of_optimisers_are_checked() {
+fn optimizer_settings_are_checked() {
     let mut config = Config { schedule: Schedule::Constant { rate: 1e300 }, ..tiny() };
     let message = |config: &Config| config.check().unwrap_err().to_string();
     assert_eq!(message(&config), "`schedule.constant.rate`: is 1e300; use 0 to 1e30");

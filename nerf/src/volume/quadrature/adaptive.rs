@@ -6,10 +6,10 @@ use crate::camera::rays::Samples;
 use crate::volume::query::Query;
 use raygrad_autograd::{Real, Scalar};
 
-/// No interval is halved more often.
+/// The most bisections of an interval.
 const MOST_HALVINGS: usize = 24;
 
-/// The field's values at one place.
+/// The field's values at one point.
 #[derive(Debug, Clone, Copy)]
 struct Node {
     t: f64,
@@ -17,22 +17,23 @@ struct Node {
     color: [f64; 3],
 }
 
-/// A node, and what follows it up to the next one.
+/// A node and the interval after it.
 #[derive(Debug, Clone, Copy)]
 struct Link {
     node: Node,
-    /// Length of the interval to the next node; 0 where there is a gap.
+    /// Length of the interval to the next node; 0 at a gap.
     length: f64,
-    /// Whether it may have to be halved.
+    /// True if it may need another bisection.
     open: bool,
 }
 
-/// The [nodes](Quadrature::nodes) of an adaptive rule, and how often density and colour were queried to find them:
-/// halves the intervals between the ends of `steps` until the estimated change of the pixel by halving one is at most
-/// `tolerance`. The change is bounded over all colours in 0..=1 that may lie behind.
+/// The [nodes](Quadrature::nodes) of an adaptive rule, and the number of density and colour queries.
 ///
-/// Intervals that no more light than `least` reaches are left out. Nothing is recorded: no gradient flows through the
-/// choice of places. A feature that shows at no node of `steps` is not found.
+/// Halves the intervals between the ends of `steps` until the estimated change of the pixel by one bisection is at most
+/// `tolerance`. The change is bounded over all background colours in 0..=1.
+///
+/// Intervals that receive no more light than `least` are left out. Nothing is recorded: no gradient flows through the
+/// choice of nodes. A feature that shows at no node of `steps` is missed.
 pub(crate) fn refine<T: Scalar>(
     query: &Query<'_, '_, T>,
     steps: &Samples<T>,
@@ -54,7 +55,7 @@ pub(crate) fn refine<T: Scalar>(
     (asker.finish(&rays, least), asker.evaluations)
 }
 
-/// Places to ask at next: the middles of open intervals that light reaches and that can be halved in this precision.
+/// The next nodes: the midpoints of open, visible intervals that this precision can halve.
 fn middles<T: Scalar>(links: &[Link], least: f64) -> Vec<f64> {
     let mut depth = 0.0_f64;
     let mut out = vec![];
@@ -72,7 +73,7 @@ fn middles<T: Scalar>(links: &[Link], least: f64) -> Vec<f64> {
     out
 }
 
-/// The links with the open intervals halved at `middles`, where the field said what `found` gives.
+/// Halves the open intervals at `middles`; `found` has the field's values there.
 fn halved(links: &[Link], middles: &[f64], found: &mut impl Iterator<Item = Node>, tolerance: f64) -> Vec<Link> {
     let mut out = Vec::with_capacity(links.len() + middles.len());
     let (mut next, mut depth) = (0, 0.0_f64);
@@ -99,8 +100,7 @@ fn halved(links: &[Link], middles: &[f64], found: &mut impl Iterator<Item = Node
     out
 }
 
-/// The most that a pixel can change when the interval from a to b of this length is halved, if all light reaches it;
-/// NaN if a number is.
+/// The largest change of a pixel by halving the interval from a to b, if all light reaches it; NaN if a value is.
 fn change(a: Node, middle: Node, b: Node, length: f64) -> f64 {
     let passed = |a: Node, b: Node, length: f64| (-0.5 * length * (a.sigma + b.sigma)).exp();
     let [whole, near, far] = [passed(a, b, length), passed(a, middle, 0.5 * length), passed(middle, b, 0.5 * length)];
@@ -109,13 +109,13 @@ fn change(a: Node, middle: Node, b: Node, length: f64) -> f64 {
         let mean = |a: Node, b: Node| 0.5 * (a.color[c] + b.color[c]);
         let halves = (1.0 - near) * mean(a, middle) + near * (1.0 - far) * mean(middle, b);
         let emitted = halves - (1.0 - whole) * mean(a, b);
-        // With black and with white behind.
+        // Over black and over white.
         Real::maximum(emitted.abs(), (emitted + difference).abs())
     };
     (0..3).map(channel).fold(0.0, Real::maximum)
 }
 
-/// Asks a field, unrecorded.
+/// Evaluates a field, unrecorded.
 struct Asker<'a, 't, T: Scalar> {
     query: &'a Query<'a, 't, T>,
     steps: &'a Samples<T>,
@@ -123,7 +123,7 @@ struct Asker<'a, 't, T: Scalar> {
 }
 
 impl<T: Scalar> Asker<'_, '_, T> {
-    /// What the field says at these distances along each ray, ray after ray.
+    /// The field's values at these distances along each ray.
     fn ask(&mut self, places: &[Vec<f64>]) -> Vec<Node> {
         let mut offsets = vec![0];
         places.iter().for_each(|places| offsets.push(offsets[offsets.len() - 1] + places.len() as u32));
@@ -143,7 +143,7 @@ impl<T: Scalar> Asker<'_, '_, T> {
         })
     }
 
-    /// The links of each ray between these nodes.
+    /// The links of each ray from the initial nodes.
     fn begin(&mut self, nodes: &Samples<T>) -> Vec<Vec<Link>> {
         let (t, delta) = (nodes.t.as_slice(), nodes.delta.as_slice());
         let rays = || nodes.segments.ranges();
@@ -153,14 +153,14 @@ impl<T: Scalar> Asker<'_, '_, T> {
         rays().map(|rows| rows.map(link).collect()).collect()
     }
 
-    /// The nodes of the intervals that light reaches.
+    /// The nodes of the visible intervals.
     fn finish(&self, rays: &[Vec<Link>], least: f64) -> Samples<T> {
         let (mut places, mut offsets) = (vec![], vec![0]);
         for links in rays {
             let (mut depth, mut before) = (0.0_f64, 0.0);
             for (i, link) in links.iter().enumerate() {
                 let length = if (-depth).exp() > least { link.length } else { 0.0 };
-                // Where an interval begins or ends.
+                // An interval begins or ends here.
                 if length != 0.0 || before != 0.0 {
                     places.push((T::from_f64(link.node.t), T::from_f64(length)));
                 }

@@ -10,20 +10,20 @@ use crate::volume::weights::Weights;
 use raygrad_autograd::{Scalar, Segments, Tensor, Var};
 use std::sync::Arc;
 
-/// Places of the two nodes of Gauss's rule, from the middle of the interval.
+/// Positions of the two Gauss nodes, from the middle of the interval.
 const GAUSS: f64 = 0.288_675_134_594_812_9;
 
-/// The intervals between two nodes each.
+/// Intervals of two nodes each.
 ///
 /// Interval k of length h with nodes a and b has the optical depth `x_k = h (sigma_a + sigma_b) / 2` and the features
-/// `(1 - f) c_a + f c_b`, f being a half for nodes at both ends, and [`gauss_share`](super::gauss_share) for those of
-/// Gauss. So its [weight](Weights) is that of its nodes, divided among the two.
+/// `(1 - f) c_a + f c_b`. f is 0.5 for nodes at both ends, and [`gauss_share`](super::gauss_share) for Gauss nodes. So
+/// its [weight](Weights) is divided between its two nodes.
 struct Intervals<T: Scalar> {
     /// The first and the second node of each, as rows of the nodes.
     ends: [Arc<[u32]>; 2],
     /// Their lengths, `[intervals]`.
     length: Tensor<T>,
-    /// Those of each ray.
+    /// The intervals of each ray.
     segments: Segments,
 }
 
@@ -42,17 +42,17 @@ impl<T: Scalar> Intervals<T> {
     /// The density at both ends of each interval, and its optical depth, each `[intervals]`.
     #[track_caller]
     fn optical_depth<'t>(&self, density: &Density<'t, T>) -> ([Var<'t, T>; 2], Var<'t, T>) {
-        // Cut where one interval is opaque, and its square still finite.
+        // `sigma` caps log densities, so that they are finite.
         let sigma = density.sigma();
         let [a, b] = self.ends.each_ref().map(|nodes| sigma.gather_rows(nodes.clone()));
         let half = sigma.tape().constant(self.length.clone()) * 0.5;
-        // Not the sum first, which may overflow.
+        // Halved before the sum, which may overflow.
         let depth = &a * &half + &b * &half;
         ([a, b], depth)
     }
 }
 
-/// Samples of the rays of `steps`: the distances and the lengths of all, and where those of each ray end.
+/// Samples on the rays of `steps` at given distances and lengths; `offsets` are the ends of each ray's samples.
 pub(super) fn placed<T: Scalar>(steps: &Samples<T>, offsets: Vec<u32>, places: Vec<(T, T)>) -> Samples<T> {
     let (t, delta): (Vec<T>, Vec<T>) = places.into_iter().unzip();
     let tensor = |values: Vec<T>| Tensor::from_vec(&[values.len()], values);
@@ -60,7 +60,7 @@ pub(super) fn placed<T: Scalar>(steps: &Samples<T>, offsets: Vec<u32>, places: V
 }
 
 impl Quadrature {
-    /// Whether the rule weights intervals of two nodes instead of samples.
+    /// Returns true if the rule weights intervals of two nodes instead of samples.
     pub(crate) fn has_intervals(self) -> bool {
         !matches!(self, Quadrature::Left | Quadrature::Midpoint)
     }
@@ -79,7 +79,7 @@ impl Quadrature {
         let (mut nodes, mut offsets) = (Vec::<(T, T)>::new(), vec![0]);
         for rows in steps.segments.ranges() {
             for i in rows.clone() {
-                // Where a step begins at the end of the one before, they may share a node.
+                // Adjacent steps share a node.
                 let follows = |i: usize| {
                     let gap = (t[i] - t[i - 1]).to_f64() - 0.5 * (delta[i] + delta[i - 1]).to_f64();
                     gap < 0.25 * delta[i].to_f64()
@@ -158,8 +158,8 @@ impl Quadrature {
         Rendered { samples, positions, directions, density, weights, optical_depth, color }
     }
 
-    /// The nodes of the intervals that more than `early_stop_eps` of the light reaches, and which of all nodes they
-    /// are.
+    /// The nodes of the intervals with more than `termination` of the light left in front, and their rows among all
+    /// nodes.
     pub(crate) fn visible_nodes<T: Scalar>(
         self,
         density: &Density<'_, T>,

@@ -3,7 +3,7 @@
 use raygrad_autograd::{Scalar, Var};
 
 const SQRT_3: f64 = 1.732_050_807_568_877_3;
-/// Below this optical depth the mean place that light comes from is a series.
+/// Below this optical depth the mean depth of emission is a series.
 const SERIES_BELOW: f64 = 0.5;
 /// `B_(2n) / (2n)!`.
 const LEAD_SERIES: [f64; 6] =
@@ -20,13 +20,13 @@ const LEAD_SERIES: [f64; 6] =
 /// 5 that would extrapolate: it is clamped at 0.
 pub fn gauss_share<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>, x: &Var<'t, T>) -> Var<'t, T> {
     let sum = a + b;
-    // In this order nothing overflows where the sum is tiny.
+    // In this order tiny sums do not overflow.
     let ratio = (b / sum.maximum(1e-37)).where_(&sum.gt(0.0), 0.5);
-    // Beyond 80 nothing changes any more, and further on the exponential has no derivative.
+    // Beyond 80 the result is constant; farther on the derivative of the exponential overflows.
     let (near, far) = (x.minimum(SERIES_BELOW), x.clamp(SERIES_BELOW, 80.0));
     let square = near.square();
-    // `1/2 - 1/x + 1/(e^x - 1)`: how far in front of the middle of the interval the light that leaves it comes from on
-    // average, as a share of its optical depth.
+    // `1/2 - 1/x + 1/(e^x - 1)`: the mean distance of emission from the middle of the interval, towards the viewer, as
+    // a share of its optical depth.
     let series = LEAD_SERIES.iter().rev().fold(x.constant(0.0), |sum, &c| sum * &square + c) * near;
     let closed = far.expm1().reciprocal() - far.reciprocal() + 0.5;
     let lead = series.where_(&x.lt(SERIES_BELOW), &closed);
@@ -39,13 +39,13 @@ mod tests {
     use raygrad_autograd::{Tape, Tensor};
 
     #[test]
-    fn gauss_share_matches_formula_and_slope() {
+    fn gauss_share_equals_formula_and_slope() {
         let tape = Tape::<f64>::new();
         for (a, b) in [(1.0, 0.0), (0.0, 1.0), (3.0, 5.0), (0.0, 0.0), (1e-30, 1e30), (2.0, 2.0)] {
             for x in [0.0, 1e-6, 0.3, 0.499, 0.5, 0.7, 5.0, 100.0, 1e30_f64] {
                 let one = |value: f64| tape.constant(Tensor::full(&[1], value));
                 let found = gauss_share(&one(a), &one(b), &one(x)).item();
-                // Where the formula has no digits left, the first term of its series.
+                // For small x the formula loses its digits, so the first term of its series is used.
                 let lead = if x < 1e-3 { x / 12.0 } else { 0.5 - 1.0 / x + 1.0 / x.exp_m1() };
                 let ratio = if a + b > 0.0 { b / (a + b) } else { 0.5 };
                 let error = (found - (ratio - 3.0_f64.sqrt() * lead).clamp(0.0, 1.0)).abs();

@@ -1,4 +1,4 @@
-//! Convergence on scenes that are known exactly, and gradients.
+//! Convergence on scenes with exact solutions, and gradients.
 
 use super::*;
 use crate::analytic::{AnalyticField, AnalyticScene, Integral, Layer, Layers, integrate, scenes};
@@ -27,7 +27,7 @@ const RULES: [Quadrature; 4] =
     [Quadrature::Left, Quadrature::Midpoint, Quadrature::PiecewiseLinear, Quadrature::Gauss2];
 
 #[test]
-fn errors_in_128_evaluations_are_those_of_the_table() {
+fn errors_at_128_evaluations_equal_the_table() {
     let table = [
         ("exponential", [5.1e-3, 8.9e-5, 5.8e-5, 2.4e-8]),
         ("gaussian", [4.8e-5, 4.8e-5, 4.9e-5, 1.2e-7]),
@@ -46,7 +46,7 @@ fn errors_in_128_evaluations_are_those_of_the_table() {
     }
 }
 
-/// The slope of the errors over evaluations in a log-log diagram, by least squares.
+/// The slope of errors over evaluations in a log-log plot, by least squares.
 fn slope(points: &[(f64, f64)]) -> f64 {
     let n = points.len() as f64;
     let logs = || points.iter().map(|(x, y)| (x.ln(), y.ln()));
@@ -54,12 +54,12 @@ fn slope(points: &[(f64, f64)]) -> f64 {
     logs().map(|(x, y)| (x - mx) * (y - my)).sum::<f64>() / logs().map(|(x, _)| (x - mx).powi(2)).sum::<f64>()
 }
 
-/// A name, the exact value, and where it is found.
+/// A name, the exact value, and the computed one.
 type Quantity = (&'static str, f64, fn(&Integral) -> f64);
 
 #[test]
-fn every_rule_converges_with_its_order() {
-    // On a smooth scene that ends abruptly, so that nothing cancels.
+fn rules_converge_with_their_order() {
+    // A smooth scene with an abrupt end, so that errors do not cancel.
     let scene = find("exponential");
     for rule in RULES {
         let order = f64::from(rule.order().unwrap());
@@ -74,7 +74,7 @@ fn every_rule_converges_with_its_order() {
             ("d depth", exact.d_depth[0], |seen| seen.d_depth[0]),
         ];
         for (what, exact, value) in quantities {
-            // Intervals, of which Gauss's rule has half as many: the slope is the same.
+            // Gauss's rule has half as many intervals, with the same slope.
             let points: Vec<_> = seen.iter().map(|(n, seen)| (*n, (value(seen) - exact).abs())).collect();
             let found = -slope(&points);
             println!("{rule:16} {what:14} order {found:.3}");
@@ -84,7 +84,7 @@ fn every_rule_converges_with_its_order() {
 }
 
 #[test]
-fn what_is_constant_is_exact_with_every_rule() {
+fn rules_are_exact_for_constant_media() {
     for rule in RULES {
         let scene = find("constant");
         let seen = integrate::<f64>(&scene, rule, 16);
@@ -104,7 +104,7 @@ fn gauss_rule_integrates_linear_colour_exactly() {
     }
 }
 
-/// The share for one interval.
+/// The Gauss share of one interval.
 fn share(a: f64, b: f64, x: f64) -> f64 {
     let tape = Tape::new();
     let [a, b, x] = [a, b, x].map(|value| tape.constant(Tensor::full(&[1], value)));
@@ -149,11 +149,11 @@ fn adaptive_quadrature_stays_near_its_tolerance() {
 }
 
 #[test]
-fn single_precision_is_as_good_as_its_digits() {
+fn single_precision_error_is_rounding() {
     for scene in scenes() {
         for rule in RULES.into_iter().chain([Quadrature::Adaptive { tolerance: 1e-4 }]) {
             let [single, double] = [integrate::<f32>(&scene, rule, 64), integrate::<f64>(&scene, rule, 64)];
-            // A node within an ULP of an edge of a layer may fall on its other side.
+            // A node within an ULP of a layer's edge may fall on the other side.
             let edges = scene.exact.d_color.len() > 1 || scene.name == "sphere";
             let bound = if edges { 3e-2 } else { 2e-6 };
             let values = |seen: &Integral| [seen.color, seen.depth, seen.transmittance];
@@ -164,7 +164,7 @@ fn single_precision_is_as_good_as_its_digits() {
     }
 }
 
-/// A voxel model of the embedded scene, small.
+/// A small voxel model of the embedded scene.
 fn small(rule: Quadrature) -> Config {
     let mut config = Config::preset(Preset::Voxel);
     config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
@@ -175,7 +175,7 @@ fn small(rule: Quadrature) -> Config {
 }
 
 #[test]
-fn every_rule_trains_and_is_part_of_the_configuration() {
+fn rules_train_and_are_configurable() {
     let data = Arc::new(ball(Split::Train, 20));
     for rule in RULES.into_iter().chain([Quadrature::Adaptive { tolerance: 1e-2 }]) {
         let config = small(rule);
@@ -205,7 +205,7 @@ fn config_without_quadrature_choice_is_read() {
 }
 
 #[test]
-fn what_no_light_reaches_is_left_out_within_the_bound() {
+fn early_termination_error_is_within_its_bound() {
     // A wall in front of everything else.
     let layer = |from, to, color| Layer { from, to, sigma: 40.0, color: [color, 0.0] };
     let medium = Arc::new(Layers::new(&[layer(1.0, 1.5, 0.8), layer(2.0, 3.0, 0.1)]));
@@ -219,7 +219,7 @@ fn what_no_light_reaches_is_left_out_within_the_bound() {
     let steps = stratified(&rays, 64, &mut Jitter::Middle, tape.pool());
     for rule in RULES.into_iter().chain([Quadrature::Adaptive { tolerance: 1e-3 }]) {
         let [all, lit] = [0.0, 1e-4].map(|least| rule.render(&Query::new(&field, &bound), &steps, least));
-        // The second ray, through nothing, keeps all of its samples.
+        // The second ray meets no density and keeps all of its samples.
         assert!(
             4 * lit.visible < 3 * all.visible && lit.density_queries <= all.density_queries,
             "{rule}: {} of {}",

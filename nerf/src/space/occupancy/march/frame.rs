@@ -5,7 +5,7 @@ use super::spacing::whole;
 
 /// A ray in units of the smallest cells, mirrored so that no coordinate falls along it.
 ///
-/// Mirroring leaves one case of each comparison, and makes a sample on a face belong to the cell that the ray enters.
+/// Mirroring leaves one case of each comparison. A sample on a face belongs to the cell that the ray enters.
 pub(super) struct LatticeRay {
     origin: [f32; 3],
     slope: [f32; 3],
@@ -24,7 +24,7 @@ impl LatticeRay {
         let mut ray = LatticeRay { origin: [0.0; 3], slope: [0.0; 3], inverse: [0.0; 3], octant: 0, span };
         let mut sum = 0.0;
         for axis in 0..3 {
-            // Far from the origin of the scene the difference has no digits in f32.
+            // Far from the origin the difference would lose its digits in f32.
             let place = (f64::from(origin[axis]) - frame.low[axis]) * frame.scale[axis];
             let slope = f64::from(direction[axis]) * frame.scale[axis];
             let mirrored = slope < 0.0;
@@ -32,13 +32,13 @@ impl LatticeRay {
             ray.origin[axis] = (if mirrored { frame.size - place } else { place }) as f32;
             ray.slope[axis] = slope.abs() as f32;
             if ray.slope[axis] == 0.0 && place <= frame.size {
-                // The upper face belongs to the box, but to no cell.
+                // The upper face belongs to the box but to no cell.
                 ray.origin[axis] = ray.origin[axis].min((frame.size as f32).next_down());
             }
             ray.inverse[axis] = 1.0 / ray.slope[axis];
             sum += ray.origin[axis] + ray.slope[axis];
         }
-        // Checked first: maxima pass over NaN.
+        // Checked first, since maxima ignore NaN.
         if !(sum.is_finite() && span[0] < span[1]) {
             return None;
         }
@@ -70,11 +70,11 @@ impl LatticeRay {
     }
 }
 
-/// What all rays of a batch need to know of the grid.
+/// The grid's geometry, common to all rays of a batch.
 pub(super) struct Frame {
-    /// Lower corner of the outermost box, in scene units.
+    /// Lower corner of the outermost cascade, in scene units.
     low: [f64; 3],
-    /// Smallest cells in a scene unit.
+    /// Smallest cells per scene unit.
     scale: [f64; 3],
     /// Smallest cells along the outermost box.
     pub size: f64,
@@ -89,7 +89,7 @@ pub(super) struct Frame {
 impl Frame {
     pub fn new(lattice: &Lattice) -> Self {
         let [low, high] = lattice.extent(lattice.cascades - 1);
-        // At most 2^17: exact in every number type here.
+        // At most 2^17, which is exact in every number type here.
         let cells = lattice.resolution << (lattice.cascades - 1);
         Frame {
             low: low.to_array(),
@@ -120,19 +120,20 @@ impl Frame {
         (cascade, block, cell)
     }
 
-    /// The smallest cascade that holds a cell of the finest size.
+    /// The smallest cascade that contains a cell of the finest size.
     #[inline(always)]
     fn cascade(&self, cell: [i32; 3]) -> u32 {
         let mut radius = 0;
         for x in cell {
             radius = radius.max(x.max(self.cells - 1 - x) - self.cells / 2);
         }
-        // Doublings from half a cascade: the exponent of a float, taken at the middle of the cell, far from a border.
+        // The logarithm of the distance in half cascades is the exponent of a float. It is taken at the middle of the
+        // cell, away from borders.
         let doublings = (radius as f32 + 0.5) / self.half as f32;
         ((doublings.to_bits() >> 23) as i32 - 126).max(0) as u32
     }
 
-    /// Where a cascade begins.
+    /// The lower corner of a cascade.
     #[inline(always)]
     fn corner(&self, cascade: u32) -> i32 {
         self.cells / 2 - (self.half << cascade)
@@ -145,12 +146,12 @@ impl Frame {
     }
 }
 
-/// How a mirrored ray's blocks and cells are numbered in the grid: down from the last along mirrored axes.
+/// The numbering of a mirrored ray's blocks and cells: downwards along mirrored axes.
 pub(super) struct Numbering {
     strides: [i32; 3],
     first: i32,
     blocks: i32,
-    /// What to flip in the number of a cell.
+    /// The bits to flip in the number of a cell.
     flip: u32,
 }
 

@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 /// Maximum number of steps along a ray.
 pub const MAX_STEPS: usize = 1 << 20;
 
-/// Samples that are worked on at a time.
+/// Samples that are computed at a time.
 pub(super) const LANES: usize = 16;
-/// What the steps of a cone hold beyond the last: a group may begin at the last sample of another.
+/// Steps of a cone beyond the last, since a group may begin at the last sample of another.
 const SPARE: usize = 2 * LANES;
 
 /// The spacing of samples along rays.
@@ -49,17 +49,17 @@ impl Step {
     }
 }
 
-/// Where the samples of one ray lie.
+/// The distances of one ray's samples.
 pub(super) trait Spacing {
     /// The distance of sample `i`, which never falls with `i`.
     fn at(&self, i: usize) -> f32;
-    /// The distances of samples `first` and the next.
+    /// The distances of `LANES` samples from `first` on.
     fn group(&self, first: usize) -> [f32; LANES];
-    /// The lengths that they stand for.
+    /// The lengths of their intervals.
     fn widths(&self, first: usize) -> [f32; LANES];
-    /// The number of samples before the distance `t`, wrong by one or by rounding; at most `max_steps`.
+    /// The number of samples before the distance `t`, up to one or to rounding; at most `max_steps`.
     fn steps_to(&self, t: f32) -> usize;
-    /// One more than the largest sample there is.
+    /// The largest number of samples.
     fn max_steps(&self) -> usize;
 }
 
@@ -81,7 +81,7 @@ impl Uniform {
 impl Spacing for Uniform {
     #[inline(always)]
     fn at(&self, i: usize) -> f32 {
-        // i is little more than 2^20: exact, and a conversion from i32 is one instruction.
+        // i is little more than 2^20, so it is exact; a conversion from i32 is one instruction.
         (i as i32 as f32).mul_add(self.length, self.start)
     }
 
@@ -113,7 +113,7 @@ impl Spacing for Uniform {
 /// Steps that grow with the distance.
 pub(super) struct Cone<'a> {
     start: f32,
-    /// The first step, from the start and from the entry.
+    /// The first step length, at the start and at the entry.
     from_start: f32,
     from_near: f32,
     cone: f32,
@@ -128,7 +128,7 @@ impl<'a> Cone<'a> {
         let start = jitter.mul_add(from_near, near);
         let from_start = step.cone.mul_add(start, step.length);
         let cone = f64::from(step.cone);
-        // Up to `far`, and as far again as a group from the last sample on reaches.
+        // Up to `far`, and further by the group that begins at the last sample.
         let is_short = |growth: &[f32]| match growth.len().checked_sub(SPARE + 1) {
             Some(last) => last + 1 < MAX_STEPS && growth[last].mul_add(from_start, start) < far,
             None => true,
@@ -175,14 +175,14 @@ impl Spacing for Cone<'_> {
     }
 }
 
-/// The whole part of a number that is limited to `0..=last` first; `last` is at most 2^30, and NaN becomes 0.
+/// The integer part of a number clamped to `0..=last`; `last` is at most 2^30, and NaN becomes 0.
 ///
-/// `as` also limits, to all of `i32`, but is compiled to code for one lane at a time.
+/// `as` also saturates, but compiles to code for one lane at a time.
 #[inline(always)]
 pub(super) fn whole(x: f32, last: f32) -> i32 {
     debug_assert!(last <= (1 << 30) as f32);
     let x = if x > 0.0 { x } else { 0.0 };
     let x = if x < last { x } else { last };
-    // SAFETY: x is neither NaN nor infinite, and its whole part is in 0..=2^30.
+    // SAFETY: x is neither NaN nor infinite, and its integer part is in 0..=2^30.
     unsafe { x.to_int_unchecked() }
 }

@@ -1,4 +1,4 @@
-//! A march returns exactly the samples of the uniform march that lie in occupied cells.
+//! A march returns exactly the samples of the uniform march in occupied cells.
 
 use super::*;
 use crate::camera::pinhole::Ray;
@@ -10,7 +10,7 @@ use rand_pcg::Pcg64Mcg;
 
 const BOX: [DVec3; 2] = [DVec3::new(-1.5, -1.0, -1.25), DVec3::new(1.5, 1.0, 1.75)];
 
-/// A grid in which about `share` of the blocks have occupied cells, about half of their cells.
+/// A grid in which about `share` of the blocks have occupied cells, about half of their cells each.
 fn random_grid(bounds: [DVec3; 2], resolution: usize, cascades: usize, share: f64, seed: u64) -> OccupancyGrid {
     let config = OccupancyConfig { resolution, cascades, ..OccupancyConfig::default() };
     let mut grid = OccupancyGrid::new(bounds, &config).unwrap();
@@ -38,7 +38,7 @@ fn march(grid: &OccupancyGrid, rays: &Rays<f32>, step: &Step) -> MarchBuffer {
     out
 }
 
-/// Whether the cell of a point in units of the smallest cells is occupied, by walking down from the definition.
+/// Returns true if the cell of a point, in units of the smallest cells, is occupied by definition.
 fn is_occupied(grid: &OccupancyGrid, point: [f64; 3]) -> bool {
     let (resolution, cascades) = (grid.resolution(), grid.cascades());
     let cells = (resolution << (cascades - 1)) as f64;
@@ -52,7 +52,7 @@ fn is_occupied(grid: &OccupancyGrid, point: [f64; 3]) -> bool {
 }
 
 #[test]
-fn a_place_is_occupied_as_its_cell_is() {
+fn is_occupied_equals_the_cell_of_the_point() {
     for cascades in [1, 3] {
         let mut grid = random_grid(BOX, 32, cascades, 0.7, 7);
         let [low, high] = grid.outer_bounds();
@@ -74,7 +74,7 @@ fn a_place_is_occupied_as_its_cell_is() {
     }
 }
 
-/// The samples of one ray, each tested for itself, with the march's rounding of positions but not its skipping.
+/// The samples of one ray, each tested separately, with the march's rounding of positions but without its skipping.
 fn brute(grid: &OccupancyGrid, rays: &Rays<f32>, step: &Step) -> Vec<f32> {
     let everything = OccupancyGrid { words: vec![u64::MAX; grid.words.len()], ..grid.clone() };
     let everything = OccupancyGrid { leaps: super::super::Leaps::new(&everything.words, &grid.lattice), ..everything };
@@ -95,7 +95,7 @@ fn brute(grid: &OccupancyGrid, rays: &Rays<f32>, step: &Step) -> Vec<f32> {
     found
 }
 
-/// All samples in the box, from formulas in f64.
+/// All samples in the box, by formulas in f64.
 fn exact_places(grid: &OccupancyGrid, ray: &Ray, span: [f64; 2], length: f64) -> Vec<f64> {
     let [near, far] = crate::clip_near_far(ray, grid.outer_bounds(), span);
     (0..).map(|i| near + (i as f64 + 0.5) * length).take_while(|t| *t < far).collect()
@@ -105,7 +105,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(400))]
 
     #[test]
-    fn as_by_brute_force(
+    fn march_equals_brute_force(
         origin in prop::array::uniform3(-3.0..3.0f64),
         direction in prop::array::uniform3(-1.0..1.0f64),
         zeroed in prop::array::uniform3(0..5u8),
@@ -137,13 +137,13 @@ proptest! {
         let found = march(&grid, &rays, &step);
         prop_assert_eq!(&found.t, &brute(&grid, &rays, &step));
         prop_assert!(found.t.windows(2).all(|pair| pair[0] < pair[1]));
-        // A limit cuts the end off.
+        // A limit truncates the result.
         let few = Step { max_samples: 5, ..step };
         prop_assert_eq!(&march(&grid, &rays, &few).t[..], &found.t[..found.t.len().min(5)]);
     }
 
     #[test]
-    fn as_in_double_precision_away_from_faces(
+    fn march_equals_double_precision_away_from_faces(
         origin in prop::array::uniform3(-4.0..4.0f64),
         target in prop::array::uniform3(-1.0..1.0f64),
         cascades in 1..4usize,
@@ -169,7 +169,7 @@ proptest! {
 }
 
 #[test]
-fn rays_along_axes_faces_and_edges_are_symmetric() {
+fn march_along_axes_faces_and_edges_is_symmetric() {
     let config = OccupancyConfig { resolution: 8, ..OccupancyConfig::default() };
     let grid = OccupancyGrid::new([DVec3::NEG_ONE, DVec3::ONE], &config).unwrap();
     let step = Step::uniform(0.25);
@@ -188,7 +188,7 @@ fn rays_along_axes_faces_and_edges_are_symmetric() {
             }
         }
     }
-    // From within, from a corner inwards and outwards, and from behind.
+    // From inside, from a corner inwards and outwards, and from behind.
     let count = |origin: DVec3, direction: DVec3| march(&grid, &one(origin, direction, [0.0, 9.0]), &step).t.len();
     assert_eq!(count(DVec3::ZERO, DVec3::X), 4);
     let diagonal = DVec3::ONE.normalize();
@@ -198,7 +198,7 @@ fn rays_along_axes_faces_and_edges_are_symmetric() {
 }
 
 #[test]
-fn rays_that_are_not_finite_have_no_samples() {
+fn march_of_non_finite_rays_is_empty() {
     let grid = random_grid(BOX, 16, 2, 1.0, 1);
     let step = Step { length: 0.1, cone: 0.01, max_samples: 100 };
     for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
@@ -239,7 +239,7 @@ fn march_far_from_origin_does_not_drift() {
             assert!((f64::from(t) - exact).abs() <= f64::from(t.next_up() - t), "{start}, step {i}");
         }
     }
-    // Steps that are far below an ULP of the distance: the limit of steps ends the march.
+    // Steps far below an ULP of the distance: the limit of steps ends the march.
     let grid = random_grid([DVec3::splat(-1e6), DVec3::splat(1e6)], 8, 1, 0.0, 5);
     let found = march(&grid, &one(DVec3::X * -3e6, DVec3::X, [0.0, 1e7]), &Step::uniform(1e-6));
     assert!(found.steps <= MAX_STEPS as u64 && found.t.is_empty());
@@ -275,7 +275,7 @@ fn cone_steps_follow_recurrence_and_tend_to_uniform() {
 }
 
 #[test]
-fn samples_carry_positions_and_segments() {
+fn march_samples_have_positions_and_segments() {
     let grid = random_grid(BOX, 16, 1, 0.4, 9);
     let mut rays = Rays::new();
     for x in [0.3, 7.0, -0.4] {
@@ -295,7 +295,7 @@ fn samples_carry_positions_and_segments() {
 }
 
 #[test]
-fn a_buffer_can_be_used_again() {
+fn march_buffer_is_reusable() {
     let (grid, other) = (random_grid(BOX, 32, 1, 0.2, 1), random_grid(BOX, 32, 2, 0.2, 2));
     let rays = one(DVec3::new(-3.0, 0.2, 0.3), DVec3::new(1.0, 0.05, -0.02).normalize(), [0.0, 9.0]);
     let mut out = MarchBuffer::default();
@@ -309,6 +309,6 @@ fn a_buffer_can_be_used_again() {
 
 #[test]
 #[should_panic(expected = "`step.length`: is 0; use a finite length above 0")]
-fn a_step_of_no_length_is_refused() {
+fn step_of_length_zero_is_an_error() {
     march(&random_grid(BOX, 8, 1, 1.0, 0), &one(DVec3::ZERO, DVec3::X, [0.0, 1.0]), &Step::uniform(0.0));
 }
