@@ -1,6 +1,6 @@
-//! A step that moves rows of a table takes no memory: its buffers are made at the first.
+//! A sparse table update allocates no memory after the first step.
 //!
-//! The test has a binary of its own, because it counts what the whole process allocates.
+//! The test has its own binary, since it counts all allocations of the process.
 
 use raygrad_autograd::{Gradient, Tensor};
 use raygrad_nerf::encoding::hash_grid::{HashGrad, HashGrid, HashGridConfig};
@@ -9,17 +9,17 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// How many bytes were asked for.
+/// The number of requested bytes.
 static BYTES: AtomicUsize = AtomicUsize::new(0);
 
-/// The system's allocator, counting.
+/// The system's allocator, with a counter.
 struct Counting;
 
 // SAFETY: every request goes to the system's allocator unchanged.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         BYTES.fetch_add(layout.size(), Relaxed);
-        // SAFETY: the caller's promises are passed on.
+        // SAFETY: the caller's promises hold for the system's allocator too.
         unsafe { System.alloc(layout) }
     }
 
@@ -33,7 +33,7 @@ unsafe impl GlobalAlloc for Counting {
 static ALLOCATOR: Counting = Counting;
 
 #[test]
-fn a_step_of_a_lazy_table_takes_no_memory() {
+fn lazy_table_step_allocates_nothing() {
     let config = HashGridConfig { levels: 6, features: 4, log2_table: 12, coarsest: 4, finest: 100 };
     let grid = HashGrid::new(&config).unwrap();
     let (mut adam, mut params) = (Adam::new(AdamConfig::default()), Params::new());
@@ -53,8 +53,8 @@ fn a_step_of_a_lazy_table_takes_no_memory() {
     for _ in 0..50 {
         step();
     }
-    // What rayon needs to hand a step over to its workers, and the table's reference count, are all there is: far less
-    // than the smallest buffer of a tile, 300 samples of one level.
+    // rayon's hand-over to its workers and the table's reference count allocate little: far less than the smallest
+    // buffer of a tile, 300 samples of one level.
     let taken = BYTES.load(Relaxed) - before;
     assert!(taken <= 50 * 1024, "{taken} bytes in 50 steps");
 }

@@ -27,7 +27,7 @@ pub fn solids() -> Vec<(Shape, Material)> {
     model.finish()
 }
 
-/// The base plate and what lies about on it.
+/// The base plate and the objects on it.
 fn ground(model: &mut Model) {
     model.brick(GREEN, [-9.0, -6.0, -PLATE], [20, 12], PLATE);
     // In front of the blade.
@@ -47,12 +47,12 @@ fn ground(model: &mut Model) {
     }
 }
 
-/// The part from `near` to `far` of the left (`side` 1) or of the right half (-1), as an interval of y.
+/// The interval of y from `near` to `far` on the left (`side` 1) or on the right (-1).
 fn span(side: f64, near: f64, far: f64) -> [f64; 2] {
     if side > 0.0 { [near, far] } else { [-far, -near] }
 }
 
-/// Where along x the axles of the tracks lie, and their height.
+/// Positions of the tracks' axles along x, and their height.
 const REAR_AXLE: f64 = -4.0;
 const FRONT_AXLE: f64 = 3.6;
 const AXLE_HEIGHT: f64 = 1.75;
@@ -62,7 +62,7 @@ const BELT: f64 = 1.35;
 /// One track: belt, wheels and the frame between them.
 fn track(model: &mut Model, side: f64) {
     for x in [REAR_AXLE, FRONT_AXLE] {
-        // The belt's round end is a whole cylinder; wheel, hub and axle stand out of it on both sides.
+        // The belt's round end is a whole cylinder; wheel, hub and axle protrude on both sides.
         let axle = [x, AXLE_HEIGHT];
         model.wheel(BLACK, span(side, 2.7, 4.5), axle, BELT);
         model.wheel(GREY, span(side, 2.6, 4.6), axle, 1.0);
@@ -84,7 +84,7 @@ fn treads(model: &mut Model, side: f64) {
     let (straight, bend) = (FRONT_AXLE - REAR_AXLE, PI * BELT);
     let count = 38;
     for i in 0..count {
-        // Along the top forwards, round the front, along the bottom backwards, round the rear.
+        // Forwards along the top, around the front, backwards along the bottom, around the rear.
         let way = i as f64 / count as f64 * 2.0 * (straight + bend);
         let (x, angle) = if way < straight {
             (REAR_AXLE + way, PI / 2.0)
@@ -101,13 +101,13 @@ fn treads(model: &mut Model, side: f64) {
     }
 }
 
-/// What both sides have: a fender, a push arm, a hydraulic ram and lamps.
+/// The parts of each side: a fender, a push arm, a hydraulic ram and lamps.
 fn side_parts(model: &mut Model, side: f64) {
     for x in [-5.0, -2.0] {
         model.brick(YELLOW, [x, span(side, 3.0, 5.0)[0], 3.6], [3, 2], PLATE);
     }
     model.bar(DARK, span(side, 3.0, 3.3), [-5.0, 3.0], [1.0, 3.0], 1.2);
-    // The push arm turns on a pin in the middle of the track and carries the blade, which the ram lifts.
+    // The push arm rotates on a pin at the middle of the track and carries the blade; the ram lifts it.
     model.bar(YELLOW, span(side, 4.9, 5.3), [-0.4, 1.5], [7.0, 1.1], 0.6);
     model.wheel(DARK, span(side, 4.6, 5.45), [-0.4, 1.5], 0.5);
     model.bar(DARK, span(side, 2.15, 2.65), [4.6, 4.3], [6.2, 3.3], 0.5);
@@ -204,7 +204,7 @@ fn driver(model: &mut Model) {
 
 /// The curved blade with its cutting edge and end plates.
 fn blade(model: &mut Model) {
-    // An arc in the plane (x, z), hollow towards the front.
+    // An arc in the plane (x, z), concave towards the front.
     let (centre, radius, pieces) = (DVec2::new(9.6, 2.6), 2.6, 10);
     let point = |i: usize| centre + radius * DVec2::from_angle(PI + 0.9 - 1.5 * i as f64 / pieces as f64);
     for i in 0..pieces {
@@ -285,7 +285,7 @@ mod tests {
         }
     }
 
-    /// Where two solids share a visible surface, rounding would choose the colour: it must be the same.
+    /// On a visible surface shared by two solids, rounding decides between their colours, so these must be equal.
     #[test]
     fn coplanar_surfaces_have_one_color() {
         let solids = solids();

@@ -16,12 +16,12 @@ pub struct Hit {
     pub solid: usize,
 }
 
-/// Deeper nodes are not split, so that a traversal fits a stack of fixed size.
+/// The depth limit, so that a traversal fits a stack of fixed size.
 const MAX_DEPTH: usize = 32;
-/// Nodes with no more shapes than this are not split.
+/// The most shapes of a leaf.
 const LEAF: usize = 2;
-/// Boxes are padded by this much. A ray within the face of a padded box (0 times infinity: NaN) then has no shape to
-/// meet there, and either answer is right.
+/// Padding of boxes. A ray within the face of a padded box (0 times infinity: NaN) then hits no shape there, so either
+/// result is right.
 const PADDING: f64 = 1e-9;
 
 /// A binary tree of boxes over shapes, split by the surface area heuristic.
@@ -163,7 +163,7 @@ impl Bvh {
             }
             for child in [first, first + 1] {
                 let bound = self.nodes[child].distance_squared(point);
-                // Inside a box the distance may be negative, so only boxes away from the point can be left out.
+                // Inside a box the distance may be negative, so only boxes away from the point can be skipped.
                 if bound == 0.0 || (nearest > 0.0 && bound < nearest * nearest) {
                     stack[top] = child as u32;
                     top += 1;
@@ -175,7 +175,8 @@ impl Bvh {
 }
 
 impl Node {
-    /// Where a ray with the inverse direction `inverse` enters the box, 0 if it starts inside, infinity if it misses.
+    /// The distance at which a ray with the inverse direction `inverse` enters the box: 0 if it starts inside, infinity
+    /// if it misses.
     #[inline]
     fn entry(&self, origin: DVec3, inverse: DVec3) -> f64 {
         let (a, b) = ((self.min - origin) * inverse, (self.max - origin) * inverse);
@@ -191,7 +192,7 @@ impl Node {
     }
 }
 
-/// The box around nothing.
+/// The empty box.
 const EMPTY: [DVec3; 2] = [DVec3::INFINITY, DVec3::NEG_INFINITY];
 
 /// The box around two boxes.
@@ -199,9 +200,9 @@ fn union(a: [DVec3; 2], b: [DVec3; 2]) -> [DVec3; 2] {
     [a[0].min(b[0]), a[1].max(b[1])]
 }
 
-/// Sorts the shapes along the axis that splits them best and returns the size of the first part.
+/// Sorts the shapes along the best axis for a split and returns the size of the first part.
 ///
-/// The surface area heuristic: a random ray meets a convex box with a probability proportional to its surface, so a
+/// The surface area heuristic: a random ray hits a convex box with a probability proportional to its surface. So a
 /// split costs the sum of surface times number of shapes over the two parts.
 fn best_split<S: Surface>(shapes: &mut [(usize, S)]) -> usize {
     let area = |[min, max]: [DVec3; 2]| {
@@ -250,11 +251,11 @@ mod tests {
     }
 
     #[test]
-    fn agrees_with_asking_every_shape() {
+    fn bvh_equals_brute_force() {
         let (shapes, bvh) = (shapes(), Bvh::new(shapes()));
         let hits = Cell::new(0);
         proptest!(ProptestConfig::with_cases(20_000), |(ray in ray())| {
-            // Half the size of the rays' range, so that many of them meet something.
+            // Half the size of the rays' range, so that many of them hit something.
             let ray = Ray { origin: ray.origin / 2.0, ..ray };
             let all = shapes.iter().filter_map(|shape| shape.intersect(&ray)).map(|(t, _)| t);
             let nearest = all.min_by(f64::total_cmp);
@@ -274,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn rays_within_faces_of_the_bounds() {
+    fn bvh_hits_rays_within_faces() {
         let bvh = Bvh::new(vec![Shape::cuboid(DVec3::NEG_ONE, DVec3::ONE)]);
         for zero in [0.0, -0.0] {
             let direction = DVec3::new(zero, 0.0, 1.0);
@@ -286,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn many_shapes_in_one_place() {
+    fn bvh_of_coinciding_shapes_is_built() {
         let bvh = Bvh::new(vec![Shape::cuboid(DVec3::NEG_ONE, DVec3::ONE); 100]);
         assert_eq!(bvh.distance(DVec3::new(3.0, 0.0, 0.0), 9.0), 2.0);
     }

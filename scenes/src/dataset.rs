@@ -6,11 +6,11 @@ use raygrad_nerf::{Camera, Ndc};
 
 use crate::{DISTANCE, Landscape, Scene, test_cameras, train_cameras, val_cameras, walk_cameras, window_cameras};
 
-/// Rays a pixel, for anti-aliasing.
+/// Rays per pixel, for anti-aliasing.
 const SAMPLES: usize = 5;
-/// Nothing is nearer to a camera than this, in scene units.
+/// The near plane, in scene units.
 const NEAR: f64 = 0.05;
-/// Nothing but the sky is farther from a camera than this, in scene units.
+/// The far plane, in scene units. Only the sky is farther.
 const FAR: f64 = 1e4;
 
 /// Renders a split of the bulldozer: 60 training, 10 validation or 20 test images, each a square of `size` pixels.
@@ -18,7 +18,7 @@ const FAR: f64 = 1e4;
 /// It takes about a second at 200 pixels on the current rayon pool.
 pub fn embedded(split: Split, size: usize) -> Dataset {
     let scene = Scene::bulldozer();
-    // Room around the model, as a real capture would have it.
+    // A margin around the model, as in a real capture.
     let [low, high] = scene.bounds();
     let bounds = [low - 0.02, high + 0.02];
     let reach = bounds[1].max(-bounds[0]).length();
@@ -64,7 +64,7 @@ pub fn landscape_ahead(split: Split, width: usize) -> Dataset {
     let cameras: Vec<Camera> = Split::ALL.into_iter().flat_map(|split| window_cameras(split, 4)).collect();
     let frames = outdoors(split, width, window_cameras);
     let data = dataset(frames, [DVec3::splat(-1.5), DVec3::splat(1.5)], [near, FAR], SceneType::ForwardFacing);
-    // They look ahead.
+    // `Some`, since the cameras are forward-facing.
     Dataset { ndc: Ndc::around(&cameras, near).ok(), ..data }
 }
 
@@ -72,7 +72,7 @@ fn dataset(frames: Vec<Frame>, bounds: [DVec3; 2], [near, far]: [f64; 2], scope:
     Dataset { frames, bounds, near, far, scope, ndc: None, placement: SceneTransform::default(), skipped: vec![] }
 }
 
-/// The frames of some cameras.
+/// Frames with the images of some cameras.
 fn frames(split: Split, cameras: Vec<Camera>, render: impl Fn(&Camera) -> Image) -> Vec<Frame> {
     let frame = |(i, camera): (usize, Camera)| {
         let image = render(&camera).into();
@@ -81,7 +81,7 @@ fn frames(split: Split, cameras: Vec<Camera>, render: impl Fn(&Camera) -> Image)
     cameras.into_iter().enumerate().map(frame).collect()
 }
 
-/// The landscape as a dataset of some cameras.
+/// The landscape's frames for the cameras of a split.
 #[track_caller]
 fn outdoors(split: Split, width: usize, cameras: fn(Split, usize) -> Vec<Camera>) -> Vec<Frame> {
     assert!(width.is_multiple_of(4), "the width must be a multiple of 4, is {width}");
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_near_the_window() {
+    fn window_sees_nothing_near() {
         let data = landscape_ahead(Split::Test, 16);
         assert_eq!((data.frames.len(), data.scope), (6, SceneType::ForwardFacing));
         for frame in &data.frames {
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn landscape_bounds_are_those_of_every_split() {
+    fn landscape_bounds_are_equal_in_all_splits() {
         let [train, val, test] = Split::ALL.map(|split| landscape(split, 4).bounds);
         assert!(train == val && val == test);
     }

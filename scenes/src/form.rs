@@ -1,4 +1,4 @@
-//! What stands in the landscape: round and angular solids, turned, scaled and set down somewhere.
+//! The solids of the landscape: round and angular forms, rotated, scaled and placed.
 
 use glam::{DVec2, DVec3, Vec3Swizzles};
 
@@ -35,7 +35,7 @@ impl Surface for Form {
             Form::Ellipsoid { centre, radii } => {
                 let (o, d) = ((ray.origin - centre) / radii, ray.direction / radii);
                 let dd = d.length_squared();
-                // As for a disc: the discriminant without the cancellation of b^2 - ac.
+                // The discriminant, written without the cancellation of b^2 - ac.
                 let root = dd - o.cross(d).length_squared();
                 if root < 0.0 {
                     return None;
@@ -60,11 +60,11 @@ impl Surface for Form {
     }
 }
 
-/// Where a ray first meets the upright cone that hangs from `tip`.
+/// The first intersection of a ray with the upright cone below `tip`.
 fn cone(ray: &Ray, tip: DVec3, radius: f64, height: f64) -> Option<(f64, DVec3)> {
     let (o, d) = (ray.origin - tip, ray.direction);
     let slope = (radius / height).powi(2);
-    // The side satisfies x^2 + y^2 = slope z^2, of which the half with z below 0 is the cone.
+    // The lateral surface satisfies x^2 + y^2 = slope z^2; the half with z below 0 is the cone.
     let form = |a: DVec3, b: DVec3| a.xy().dot(b.xy()) - slope * a.z * b.z;
     let (a, b, c) = (form(d, d), form(o, d), form(o, o));
     let mut nearest: Option<(f64, DVec3)> = None;
@@ -75,8 +75,8 @@ fn cone(ray: &Ray, tip: DVec3, radius: f64, height: f64) -> Option<(f64, DVec3)>
     };
     let root = b * b - a * c;
     if root >= 0.0 {
-        // The larger of the two roots' numerators, which does not cancel, gives both. For a ray along the side a is 0:
-        // then one root is infinite or NaN and fails the comparison.
+        // The larger numerator of the two roots does not cancel and gives both roots. For a ray along the surface a is
+        // 0. One root is then infinite or NaN and fails the comparison.
         let q = -(b + root.sqrt().copysign(b));
         for t in [q / a, c / q] {
             let point = o + t * d;
@@ -92,21 +92,21 @@ fn cone(ray: &Ray, tip: DVec3, radius: f64, height: f64) -> Option<(f64, DVec3)>
     nearest
 }
 
-/// A solid where it stands: turned around the vertical, then scaled, then moved.
+/// A form with a rotation around the vertical, a scale and a position, applied in this order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Placed {
-    /// The solid before that.
+    /// The form before the transform.
     pub form: Form,
-    /// Where its origin comes to lie.
+    /// The position of its origin.
     pub base: DVec3,
-    /// Cosine and sine of the angle by which it is turned.
+    /// Cosine and sine of the angle of rotation.
     pub turn: DVec2,
-    /// How many times larger it becomes, positive.
+    /// The scale factor, positive.
     pub scale: f64,
 }
 
 impl Placed {
-    /// The point of the solid before it was placed that came to lie at `point`.
+    /// Transforms a point of the scene into the coordinates of the form.
     pub fn local(&self, point: DVec3) -> DVec3 {
         self.turned_back(point - self.base) / self.scale
     }
@@ -144,8 +144,7 @@ mod tests {
     use super::super::shape::tests::ray;
     use super::*;
 
-    /// How far a point is from the surface along the vertical or the radius, in parts of the solid: 0 on it, below 0
-    /// inside.
+    /// A signed distance along the vertical or the radius, relative to the solid: 0 on the surface, below 0 inside.
     fn implicit(form: &Form, point: DVec3) -> f64 {
         match form {
             Form::Extrusion(shape) => shape.distance(point),
@@ -176,7 +175,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(2000))]
         #[test]
-        fn landscape_solids_are_met_first_where_they_begin(placed in placed(), ray in ray()) {
+        fn solids_are_hit_at_their_first_surface(placed in placed(), ray in ray()) {
             let at = |t: f64| implicit(&placed.form, placed.local(ray.at(t)));
             let hit = placed.intersect(&ray);
             let inside = at(0.0) < 0.0;
@@ -189,7 +188,7 @@ mod tests {
                 let out = |side: f64| implicit(&placed.form, placed.local(ray.at(t) + side * step * normal));
                 prop_assert!(out(1.0) > 0.0, "{}", out(1.0));
                 if let Form::Ellipsoid { .. } = placed.form {
-                    // Sideways the surface is left by the square of a step only.
+                    // A tangential step leaves the surface by its square only.
                     let aside = step * normal.any_orthonormal_vector();
                     let sides = [aside, normal.cross(aside)].map(|u| implicit(&placed.form, placed.local(ray.at(t) + u)));
                     prop_assert!(sides.iter().all(|side| side.abs() < 1e-7), "{sides:?}");
@@ -206,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn landscape_solids_are_met_where_a_hand_computes_it() {
+    fn solids_are_hit_at_known_distances() {
         let ball = Form::Ellipsoid { centre: DVec3::new(0.0, 0.0, 2.0), radii: DVec3::ONE };
         let cone = Form::Cone { base: DVec3::ZERO, radius: 1.0, height: 2.0 };
         let place =
@@ -214,7 +213,7 @@ mod tests {
         let along = |z: f64| Ray { origin: DVec3::new(0.0, 0.0, z), direction: DVec3::X };
         for (form, scale, z, distance) in [
             (&ball, 10.0, 20.0, 90.0),
-            // A chord of the ball 6 off its centre: half as long as sqrt(10^2 - 6^2) = 8.
+            // A chord of the ball at 6 from its centre has half the length sqrt(10^2 - 6^2) = 8.
             (&ball, 10.0, 26.0, 92.0),
             (&cone, 10.0, 10.0, 95.0),
             (&cone, 10.0, 5.0, 92.5),
@@ -223,7 +222,7 @@ mod tests {
             assert!((t - distance).abs() < 1e-10, "{form:?}: {t}");
             assert!(place(form.clone(), scale).intersect(&along(41.0)).is_none());
         }
-        // Straight down through the tip's side, and up through the disc that the cone stands on.
+        // Straight down through the side near the tip, and up through the base.
         let down = Ray { origin: DVec3::new(0.25, 0.0, 5.0), direction: DVec3::NEG_Z };
         assert!((cone.intersect(&down).unwrap().0 - 3.5).abs() < 1e-12);
         let up = Ray { origin: DVec3::new(0.25, 0.0, -5.0), direction: DVec3::Z };

@@ -1,4 +1,4 @@
-//! Points that never bunch up.
+//! The golden angle, for uniform points.
 
-/// The golden angle in radians: points a golden angle apart on a circle never bunch up, however many they are.
+/// The golden angle in radians: points at multiples of it on a circle never cluster, for any number of points.
 pub(super) const GOLDEN_ANGLE: f64 = 2.399963229728653;

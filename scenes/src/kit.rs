@@ -8,18 +8,18 @@ use super::paint::linear;
 use super::shade::Material;
 use super::shape::{Axis, Profile, Shape, Surface};
 
-/// Scene units in a stud pitch.
+/// Scene units per stud pitch.
 const PITCH: f64 = 0.113;
-/// The point of the model that lies at the origin of the scene.
+/// The model point at the scene's origin.
 const CENTRE: DVec3 = DVec3::new(1.0, 0.0, 2.1);
 /// Height of a plate.
 pub const PLATE: f64 = 0.4;
 /// Height of a brick.
 pub const BRICK: f64 = 1.2;
-/// Bricks are this much smaller than their grid on each side and on top, which leaves visible seams.
+/// Bricks are smaller than their grid by this much on each side and on top, which leaves visible seams.
 const GAP: f64 = 0.03;
 
-/// A colour as sRGB codes, and how rough it is: see [`Material`].
+/// A colour as sRGB codes, and its roughness: see [`Material`].
 #[derive(Clone, Copy)]
 pub struct Paint([u8; 3], f64);
 
@@ -43,7 +43,7 @@ impl Paint {
     }
 }
 
-/// Solids in scene units, added in stud pitches. Every method takes x forwards, y to the left and z up.
+/// Solids in scene units; methods take stud pitches. Coordinates are x forwards, y to the left and z up.
 #[derive(Default)]
 pub struct Model {
     solids: Vec<(Shape, Material)>,
@@ -85,7 +85,7 @@ impl Model {
     /// the right and z up. They must be convex.
     pub fn prism(&mut self, paint: Paint, y: [f64; 2], corners: &[[f64; 2]]) {
         let [start, end] = y.map(|y| place([0.0, y, 0.0]).y);
-        // Profiles along y are in the plane (z, x), which turns the other way round.
+        // Profiles along y are in the plane (z, x), which has the opposite orientation.
         let corners = corners.iter().rev().map(|&[x, z]| place([x, 0.0, z])).map(|p| DVec2::new(p.z, p.x)).collect();
         let shape = Shape { axis: Axis::Y, span: [start, end], profile: Profile::Polygon(corners) };
         self.solids.push((shape, paint.material()));
@@ -111,7 +111,7 @@ impl Model {
     }
 }
 
-/// A point of the model in scene units.
+/// Converts a model point to scene units.
 fn place(point: [f64; 3]) -> DVec3 {
     (DVec3::from(point) - CENTRE) * PITCH
 }

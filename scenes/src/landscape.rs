@@ -15,11 +15,11 @@ use raygrad_nerf::Image;
 use raygrad_nerf::SrgbEncode;
 use raygrad_nerf::{Camera, Ray};
 
-/// How rough everything but the bulldozer is.
+/// The roughness of everything but the bulldozer.
 const ROUGHNESS: f64 = 0.95;
-/// A pixel that sees a surface at a slant covers more of it: at most by this factor on solids.
+/// The largest factor by which a slanted surface enlarges the footprint of a pixel on solids.
 const STEEPEST: f64 = 8.0;
-/// The bulldozer dims the sky's light on the ground up to this distance from the middle, in scene units.
+/// The bulldozer occludes the sky on the ground up to this distance from the origin, in scene units.
 const DIMMED: f64 = 2.0;
 
 /// The [bulldozer](Scene::bulldozer) on a plane that reaches to hills a thousand units away, under an infinitely
@@ -32,7 +32,7 @@ const DIMMED: f64 = 2.0;
 pub struct Landscape {
     bulldozer: Scene,
     scenery: Bvh<Placed>,
-    /// The solids of the scenery with their paints, by the numbers that `scenery` knows them by.
+    /// The solids of the scenery with their paints, by their indices in `scenery`.
     things: Vec<(Placed, Paint)>,
 }
 
@@ -65,7 +65,7 @@ impl Landscape {
     /// Height of the ground in scene units: the plane `z = GROUND`.
     pub const GROUND: f64 = GROUND;
 
-    /// Where a ray first meets a surface, or `None` if it leaves into the sky.
+    /// Finds the first surface along a ray; returns `None` if it leaves into the sky.
     ///
     /// [`Hit::solid`] counts the solids of the bulldozer as in [its own scene](Scene), then all others, and the ground
     /// last.
@@ -73,7 +73,7 @@ impl Landscape {
         let first = self.bulldozer.materials.len();
         let height = ray.origin.z - GROUND;
         let distance = -height / ray.direction.z;
-        // The ground is seen from above only: a ray that starts on it would meet it at a distance of rounding.
+        // The ground has no lower side, and a ray that starts on it must not hit it at a distance of rounding.
         let mut nearest = (height > 0.0 && ray.direction.z < 0.0).then_some(Hit {
             distance,
             normal: DVec3::Z,
@@ -115,7 +115,7 @@ impl Landscape {
     /// The mean colour of a pixel.
     fn pixel(&self, camera: &Camera, column: usize, row: usize, pattern: &Pattern) -> [f32; 3] {
         let samples = pattern.0.len() as f64;
-        // The angle that a pixel covers, in radians, a little more towards the edges of the image than there is.
+        // The angle of a pixel in radians, slightly too large towards the edges of the image.
         let angle = 1.0 / camera.focal[0].min(camera.focal[1]);
         let mut sum = DVec3::ZERO;
         let mut last: Option<(Hit, f64)> = None;
@@ -123,7 +123,7 @@ impl Landscape {
         for &(offset, sun) in &pattern.0 {
             let ray = camera.ray(column as f64 + 0.5 + offset.x, row as f64 + 0.5 + offset.y);
             let Some(hit) = self.trace(&ray) else {
-                // The sky of a footprint is smooth across the pixel: one ray of it is enough.
+                // The sky is filtered to the pixel, so one ray is enough.
                 sum += *behind.get_or_insert_with(|| sky(ray.direction, shade::sun_direction(0, 1), angle));
                 continue;
             };
@@ -135,12 +135,12 @@ impl Landscape {
                     let footprint = hit.distance * angle / slant.max(1.0 / STEEPEST);
                     let local = solid.local(point);
                     let albedo = paint.albedo(local, footprint / solid.scale);
-                    // Near the ground less of the sky is seen.
+                    // Near the ground less of the sky is visible.
                     (Material { albedo, roughness: ROUGHNESS }, 0.6 + 0.4 * (local.z / 0.4).clamp(0.0, 1.0))
                 }
                 Part::Ground => {
                     let across = hit.distance * angle;
-                    // The rays of a pixel lie at as many heights, so that they share its length on the ground among them.
+                    // The rays of a pixel have different heights, so each takes its share of the footprint's length.
                     let along = across * (1.0 / (slant * samples)).max(1.0);
                     let albedo = ground(point.xy(), ray.direction.xy().normalize_or_zero(), [along, across]);
                     let near = point.xy().length() < DIMMED;
@@ -150,14 +150,14 @@ impl Landscape {
             };
             let occluded = |ray: &Ray| self.bulldozer.bvh.occluded(ray) || self.scenery.occluded(ray);
             let light = shade::radiance(occluded, &material, &ray, &hit, sun, openness);
-            // Clamped before the mean, or the edge of a highlight would stay jagged.
+            // Clamped before the mean: otherwise the edge of a highlight would be jagged.
             sum += through_air(light, hit.distance).clamp(DVec3::ZERO, DVec3::ONE);
         }
         (sum / samples).to_array().map(|c| SrgbEncode.f([c]) as f32)
     }
 }
 
-/// An image whose pixels are each filled from its column and its row, rows in parallel.
+/// Fills the pixels of an image by column and row; rows run in parallel.
 fn rows(camera: &Camera, channels: usize, fill: impl Fn(usize, usize, &mut [f32]) + Sync) -> Image {
     let mut image = Image::new(camera.width, camera.height, channels);
     if camera.width > 0 {
@@ -189,9 +189,9 @@ mod tests {
     }
 
     #[test]
-    fn landscape_ground_is_where_a_hand_computes_it() {
+    fn landscape_ground_is_at_known_distances() {
         let landscape = Landscape::new();
-        // Down along the sides of a triangle 3, 4, 5.
+        // Downwards along the sides of a 3-4-5 triangle.
         for (height, distance) in [(1.0, 1.25), (2.0, 2.5), (4.0, 5.0)] {
             let origin = DVec3::new(2.0, -2.0, GROUND + height);
             let hit = landscape.trace(&Ray { origin, direction: DVec3::new(0.36, -0.48, -0.8) }).unwrap();
@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn landscape_balls_are_where_a_hand_computes_it() {
+    fn landscape_balls_are_at_known_distances() {
         let landscape = Landscape::new();
         let eye = DVec3::new(0.0, 0.0, GROUND + 3.0);
         let [mut near, mut far, first] = [0, 0, landscape.bulldozer.materials.len()];
@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn landscape_bulldozer_is_that_of_its_own_scene() {
+    fn landscape_bulldozer_equals_its_own_scene() {
         let (landscape, alone) = (Landscape::new(), Scene::bulldozer());
         let mut seen = 0;
         for camera in &walk_cameras(Split::Val, 64)[..4] {
@@ -244,7 +244,7 @@ mod tests {
                 if inside.color.data[4 * i + 3] < 1.0 || distances.data[i] != inside.depth.data[i] {
                     continue;
                 }
-                // The air between adds next to nothing.
+                // The air in between adds almost nothing.
                 let pairs = outside.data[3 * i..][..3].iter().zip(&inside.color.data[4 * i..][..3]);
                 assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 0.02), "pixel {i}");
                 seen += 1;
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn landscape_is_the_same_on_any_number_of_threads() {
+    fn landscape_is_equal_on_any_number_of_threads() {
         let camera = &walk_cameras(Split::Test, 40)[7];
         let render = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -268,9 +268,9 @@ mod tests {
         assert!(serial == render(2) && serial == render(2));
     }
 
-    /// The cameras see some of everything that the landscape is for.
+    /// The cameras see surfaces at all distances, and the sky.
     #[test]
-    fn landscape_has_surfaces_at_all_distances_and_a_sky() {
+    fn landscape_views_see_all_distances_and_the_sky() {
         let landscape = Landscape::new();
         let all = rays(Split::Train, 40);
         let distances: Vec<_> = all.iter().map(|ray| landscape.trace(ray).map(|hit| hit.distance)).collect();
@@ -291,7 +291,7 @@ mod tests {
         assert!(all.iter().zip(&distances).all(|(ray, d)| d.is_some() || ray.direction.z > 0.0));
     }
 
-    /// Nobody looks past the hills to where the plane would go on for ever.
+    /// No camera sees past the hills to the infinite plane.
     #[test]
     fn landscape_hills_have_no_gap() {
         let landscape = Landscape::new();
@@ -303,7 +303,7 @@ mod tests {
         }
     }
 
-    /// What a pixel of the ground shows is the mean of what smaller pixels show there, near and far: nothing aliases.
+    /// A ground pixel equals the mean of smaller pixels, near and far: nothing aliases.
     #[test]
     fn landscape_ground_does_not_alias() {
         let landscape = Landscape::new();
@@ -313,7 +313,7 @@ mod tests {
             let large = camera.resized(64 * factor, 48 * factor);
             let (seen, truth) = (landscape.render(camera, 5), landscape.render(&large, 1).downscaled(factor));
             for (column, row) in (0..48).flat_map(|row| (0..64).map(move |column| (column, row))) {
-                // Corners and middle all see the ground, so that no edge of something else is compared.
+                // Corners and centre all see the ground, so that no edge of another object is compared.
                 let at = |x: f64, y: f64| landscape.trace(&camera.ray(column as f64 + x, row as f64 + y));
                 let hits = [at(0.5, 0.5), at(0.0, 0.0), at(1.0, 0.0), at(0.0, 1.0), at(1.0, 1.0)];
                 let ground = |hit: &Option<Hit>| hit.is_some_and(|hit| matches!(landscape.part(&hit), Part::Ground));
@@ -324,7 +324,7 @@ mod tests {
                 count[zone] += 1;
             }
         }
-        // Far away stripes and shadows are finer than a pixel, of which five rays know less than 64.
+        // Far away, stripes and shadows are finer than a pixel; five rays sample them worse than 64.
         for (zone, limit) in [0.013, 0.022].into_iter().enumerate() {
             let rms = (squares[zone] / f64::from(count[zone])).sqrt();
             println!("zone {zone}: {rms:.4} over {} pixels", count[zone]);

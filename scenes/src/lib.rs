@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn everything_lies_within_the_bounds() {
+    fn scene_lies_within_its_bounds() {
         let scene = Scene::bulldozer();
         let [min, max] = scene.bounds();
         assert!(min.min_element() > -1.5 && max.max_element() < 1.5, "{min} {max}");
@@ -102,7 +102,7 @@ mod tests {
         }
     }
 
-    /// The same point of the cab's roof has another colour from another side.
+    /// One point of the cab's roof differs in colour between two sides.
     #[test]
     fn colors_depend_on_the_viewing_direction() {
         let scene = Scene::bulldozer();

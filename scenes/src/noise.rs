@@ -1,9 +1,9 @@
-//! Noise with detail at every scale, of which only those scales are computed that a pixel can show.
+//! Noise with detail at every scale, filtered to a pixel's footprint.
 
 use glam::{DMat2, DVec2, DVec3, Vec3Swizzles};
 
-/// Gradient noise (Perlin 2002): smooth, about 1 in size, of mean 0, with features of about the length 1. In the plane
-/// z = 0 it is as good and takes half the time.
+/// Gradient noise (Perlin 2002): smooth, with mean 0, magnitude 1 and features of about the length 1. The plane z = 0
+/// has the same quality at half the time.
 fn gradient_noise(point: DVec3, seed: u32) -> f64 {
     let cell = point.floor();
     let within = point - cell;
@@ -12,7 +12,7 @@ fn gradient_noise(point: DVec3, seed: u32) -> f64 {
     let slope = |x: i64, y: i64, z: i64| {
         let hash = hash([corner[0] + x, corner[1] + y, corner[2] + z].map(|i| i as u32), seed);
         let from = within - DVec3::new(x as f64, y as f64, z as f64);
-        // One of the twelve directions to the middles of a cube's edges.
+        // One of twelve gradients towards the middles of a cube's edges.
         let (u, v) = match hash % 3 {
             0 => (from.x, from.y),
             1 => (from.y, from.z),
@@ -28,7 +28,7 @@ fn gradient_noise(point: DVec3, seed: u32) -> f64 {
     if within.z == 0.0 { layer(0) } else { mix(layer(0), layer(1), fade.z) }
 }
 
-/// Unrelated numbers for neighbouring points of a lattice.
+/// Hashes a lattice point, so that neighbours get unrelated numbers.
 fn hash(point: [u32; 3], seed: u32) -> u32 {
     let [x, y, z] = point;
     let mut h = x.wrapping_mul(0x9e37_79b1) ^ y.wrapping_mul(0x85eb_ca77) ^ z.wrapping_mul(0xc2b2_ae3d) ^ seed;
@@ -38,20 +38,20 @@ fn hash(point: [u32; 3], seed: u32) -> u32 {
     h ^ (h >> 15)
 }
 
-/// How much of features of the size `length` a pixel shows that covers `footprint`: all if they are twice as large, nothing
-/// if they are half as large, which average out within it. In between the share is near that of a pixel's mean.
+/// The share of features of the size `length` that a pixel of the diameter `footprint` shows. It is 1 from twice the
+/// footprint on, and 0 below half of it, where features average out. In between it approximates the pixel's mean.
 fn visible(length: f64, footprint: f64) -> f64 {
     let t = ((length / footprint - 0.5) / 1.5).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
 
-/// A sum of noise whose features have the length `longest`, and that divided by 2, 4, 8 ... in `octaves` steps, each
-/// `gain` times as strong as the one before. Mean 0.
+/// A sum of noise octaves with mean 0. The features have the length `longest`, then half of it, and so on in `octaves`
+/// steps. Each octave is `gain` times as strong as the one before.
 ///
-/// Features that a pixel of the diameter `footprint` is too coarse for fade to their mean: the sum is what a pixel would
-/// average, whether near or far.
+/// Features finer than a pixel of the diameter `footprint` fade to their mean, so that the sum approximates the mean
+/// over the pixel at any distance.
 pub fn fractal(point: DVec3, longest: f64, octaves: usize, gain: f64, footprint: f64, seed: u32) -> f64 {
-    // Every octave is turned, so that their lattices do not line up, and moved, or all would be 0 at the origin.
+    // Every octave is rotated, so that lattices do not align, and shifted, since all are 0 at the origin.
     let turn = DMat2::from_cols(DVec2::new(0.8, 0.6), DVec2::new(-0.6, 0.8));
     let (mut point, mut length, mut strength, mut sum) = (point / longest, longest, 1.0, 0.0);
     for octave in 0..octaves {
@@ -68,20 +68,20 @@ pub fn fractal(point: DVec3, longest: f64, octaves: usize, gain: f64, footprint:
     sum
 }
 
-/// The share of the interval of length `width` around `at` that lies below 0: a step that a pixel has averaged.
+/// The share of the interval of length `width` around `at` that is below 0: a step, filtered to a pixel.
 pub fn below(at: f64, width: f64) -> f64 {
     (0.5 - at / width).clamp(0.0, 1.0)
 }
 
-/// The share of the interval of length `width` around `at` that lies in the first half of each period of length 1: stripes
-/// that a pixel has averaged.
+/// The share of the interval of length `width` around `at` in the first half of each period of length 1: stripes,
+/// filtered to a pixel.
 pub fn stripes(at: f64, width: f64) -> f64 {
     // The integral of the stripes from 0.
     let integral = |x: f64| 0.5 * x.floor() + (x - x.floor()).min(0.5);
     (integral(at + 0.5 * width) - integral(at - 0.5 * width)) / width
 }
 
-/// A number in 0..1 that seems random, for each pair of numbers.
+/// A pseudo-random number in 0..1 for each pair of numbers.
 pub fn random(index: usize, purpose: u32) -> f64 {
     f64::from(hash([index as u32, 0, 0], purpose.wrapping_mul(0x27d4_eb2f))) / 4_294_967_296.0
 }
@@ -90,7 +90,7 @@ pub fn random(index: usize, purpose: u32) -> f64 {
 mod tests {
     use super::*;
 
-    /// Random points, far from each other and from the lattice's regularities.
+    /// Random points, far from each other and without the lattice's regularity.
     fn point(i: usize) -> DVec3 {
         DVec3::from([1, 2, 3].map(|k| 500.0 * random(i, k) - 250.0))
     }
@@ -107,7 +107,7 @@ mod tests {
         }
     }
 
-    /// The plane z = 0 takes a shortcut, which continues what is beside it.
+    /// The plane z = 0 takes a shortcut, which must continue the noise beside it.
     #[test]
     fn landscape_noise_is_continuous() {
         for i in 0..2000 {
@@ -120,7 +120,7 @@ mod tests {
         }
     }
 
-    /// The mean of what a pixel of some size shows differs little from what a single ray of that footprint computes.
+    /// A filtered sample must be close to the mean over a pixel of that footprint.
     #[test]
     fn noise_of_footprint_is_its_mean() {
         for footprint in [0.1, 0.5, 2.0, 8.0] {

@@ -56,10 +56,10 @@ impl Scene {
         view
     }
 
-    /// The colour and coverage of a pixel, and what the ray through its centre hits.
+    /// The colour and coverage of a pixel, and the hit of the ray through its centre.
     fn pixel(&self, camera: &Camera, column: usize, row: usize, pattern: &Pattern) -> ([f32; 4], Option<Hit>) {
         let (mut sum, mut covered, mut centre) = (DVec3::ZERO, 0, None);
-        // The sky's light varies slowly: within a pixel it is sampled once for each run of hits on one side of a solid.
+        // Sky occlusion varies slowly: within a pixel it is sampled once per run of hits on one side of a solid.
         let mut last: Option<(Hit, f64)> = None;
         for (i, &(offset, sun)) in pattern.0.iter().enumerate() {
             let ray = camera.ray(column as f64 + 0.5 + offset.x, row as f64 + 0.5 + offset.y);
@@ -70,7 +70,7 @@ impl Scene {
             let openness = self.openness(&hit, ray.at(hit.distance), &mut last);
             let light =
                 shade::radiance(|ray| self.bvh.occluded(ray), &self.materials[hit.solid], &ray, &hit, sun, openness);
-            // Clamped before the mean, or the edge of a highlight would stay jagged.
+            // Clamped before the mean: otherwise the edge of a highlight would be jagged.
             sum += light.clamp(DVec3::ZERO, DVec3::ONE);
             covered += 1;
         }
@@ -81,8 +81,8 @@ impl Scene {
         ([r, g, b, covered as f32 / pattern.0.len() as f32], centre)
     }
 
-    /// How much of the sky the scene leaves to a place that is hit: sampled once for each run of hits on one side of a
-    /// solid, of which `last` keeps the last.
+    /// The share of the sky that is visible from a hit, sampled once per run of hits on one side of a solid; `last`
+    /// keeps the last sample.
     pub(super) fn openness(&self, hit: &Hit, point: DVec3, last: &mut Option<(Hit, f64)>) -> f64 {
         let openness = match *last {
             Some((near, openness)) if near.solid == hit.solid && near.normal.dot(hit.normal) > 0.9 => openness,
@@ -93,14 +93,14 @@ impl Scene {
     }
 }
 
-/// Where the rays of a pixel pass, in pixels from its centre, and to which point of the sun each of them looks: the
-/// pixel's area and the sun's disc are averaged together.
+/// The offsets of a pixel's rays from its centre, in pixels, with a direction to the sun's disc each. The means over
+/// the pixel's area and the sun's disc are taken together.
 pub(super) struct Pattern(pub(super) Vec<(DVec2, DVec3)>);
 
 impl Pattern {
     pub(super) fn new(samples: usize) -> Self {
-        // The R2 sequence: multiples of (1/p, 1/p^2), where p is the plastic number, p^3 = p + 1, modulo the pixel. Its
-        // terms 0, 1, -1, 2, -2 ... are as evenly spread as 0, 1, 2 ... and symmetric about the centre.
+        // The R2 sequence: multiples of (1/p, 1/p^2) modulo the pixel, where p is the plastic number, p^3 = p + 1. Its
+        // terms 0, 1, -1, 2, -2 .. are as uniform as 0, 1, 2 .. and symmetric about the centre.
         let plastic = 1.324717957244746;
         let step = DVec2::new(1.0 / plastic, 1.0 / (plastic * plastic));
         let term = |i: usize| {
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_lie_in_the_pixel_around_its_centre() {
+    fn sample_pattern_is_centred_in_the_pixel() {
         for samples in [1, 5, 9, 25] {
             let Pattern(pattern) = Pattern::new(samples);
             assert_eq!(pattern[0].0, DVec2::ZERO);
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn values_are_in_range() {
+    fn rendered_values_are_in_range() {
         let view = render(2);
         assert!(view.color.data.iter().all(|v| (0.0..=1.0).contains(v)));
         assert!(view.color.data.chunks(4).all(|p| p[3] > 0.0 || p == [0.0; 4]));
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_looks_away_sees_nothing() {
+    fn render_of_a_camera_looking_away_is_empty() {
         let mut camera = test_cameras(1, 8).remove(0);
         camera.pose.translation *= -1.0;
         let view = Scene::bulldozer().render(&camera, 3);

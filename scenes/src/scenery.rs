@@ -1,6 +1,6 @@
-//! What is scattered over the landscape: things of many sizes near and far, and the hills on the horizon.
+//! The scenery of the landscape: objects of many sizes, near and far, and the hills on the horizon.
 //!
-//! Sizes grow with the distance from the middle, so that near and far things cover about as many pixels.
+//! Sizes grow with the distance from the origin, so that near and far objects cover about as many pixels.
 
 use std::f64::consts::TAU;
 
@@ -12,22 +12,22 @@ use super::noise::random;
 use super::paint::{Paint, Pattern, linear, road_distance};
 use super::shape::{Axis, Profile, Shape};
 
-/// Height of the ground: the base plate of the bulldozer lies on it.
+/// Height of the ground, on which the bulldozer's base plate lies.
 pub const GROUND: f64 = -0.2825;
-/// Between these distances from the middle things stand that a photographer can walk around in.
+/// The range of distances from the origin of low objects, which cameras can walk around in.
 const LOW: [f64; 2] = [2.4, 6.0];
-/// How many they are.
+/// The number of low objects.
 const LOW_COUNT: usize = 22;
-/// Between these distances everything else stands, but for the hills.
+/// The range of distances of all other objects except hills.
 const TALL: [f64; 2] = [7.5, 760.0];
-/// How many they are.
+/// The number of these objects.
 const TALL_COUNT: usize = 170;
-/// How many hills stand on the horizon.
+/// The number of hills on the horizon.
 const HILLS: usize = 26;
-/// How many mountains stand behind them.
+/// The number of mountains behind them.
 const MOUNTAINS: usize = 17;
 
-/// Solids of one thing, and where it stands.
+/// Solids of one object, and its position.
 struct Site<'a> {
     solids: &'a mut Vec<(Placed, Paint)>,
     base: DVec3,
@@ -178,10 +178,10 @@ fn crate_(site: &mut Site<'_>, choice: f64) {
     site.block(patterned([wood, shade(wood, 0.6)], Pattern::Courses(0.25)), [-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]);
 }
 
-/// Builds a thing at a site, with a number in 0..1 to vary it by.
+/// Builds an object at a site; a number in 0..1 varies it.
 type Kind = fn(&mut Site<'_>, f64);
 
-/// Everything that stands on the ground but for the bulldozer.
+/// All solids of the scenery on the ground, without the bulldozer.
 pub fn solids() -> Vec<(Placed, Paint)> {
     let mut solids = vec![];
     let low: [Kind; 5] = [rock, traffic_cone, ball, crate_, rock];
@@ -192,7 +192,7 @@ pub fn solids() -> Vec<(Placed, Paint)> {
     solids
 }
 
-/// Things at distances that grow by a constant factor, in all directions, off the road.
+/// Objects at distances that grow by a constant factor, in all directions, off the road.
 fn scatter(
     solids: &mut Vec<(Placed, Paint)>,
     count: usize,
@@ -213,7 +213,7 @@ fn scatter(
     }
 }
 
-/// A ring of wooded hills without a gap, and mountains with snow on them that look over it.
+/// A closed ring of wooded hills, and snow-capped mountains that rise above it.
 fn hills(solids: &mut Vec<(Placed, Paint)>) {
     let ring =
         |solids: &mut Vec<(Placed, Paint)>, count, distance: f64, seed, build: &dyn Fn(usize) -> (Form, Paint)| {

@@ -1,4 +1,4 @@
-//! What colour a surface shows: glossy plastic under a soft sun and a hemispheric sky.
+//! Shading of surfaces: glossy plastic under a soft sun and a hemispheric sky.
 
 use std::f64::consts::PI;
 
@@ -8,7 +8,7 @@ use super::bvh::{Bvh, Hit};
 use super::golden::GOLDEN_ANGLE;
 use raygrad_nerf::Ray;
 
-/// A diffuse body under a clear, more or less smooth surface.
+/// A diffuse material with a clear coat of some roughness.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Material {
     /// Diffuse reflectance, linear RGB in 0..=1.
@@ -29,9 +29,9 @@ const SKY_COLOR: DVec3 = DVec3::new(1.25, 1.35, 1.45);
 const GROUND_COLOR: DVec3 = DVec3::new(0.85, 0.8, 0.72);
 /// Reflectance of plastic at normal incidence (refractive index 1.5).
 const F0: f64 = 0.04;
-/// How far from a surface others take light from it, in scene units, and by how much.
+/// The distances from a surface at which others occlude it, in scene units, and the weight of each.
 const OCCLUDERS: [(f64, f64); 4] = [(0.02, 0.2), (0.06, 0.25), (0.14, 0.25), (0.3, 0.2)];
-/// Secondary rays start this far off the surface, well above the rounding error of a hit.
+/// The offset of secondary rays from the surface, well above the rounding error of a hit.
 const OFFSET: f64 = 1e-6;
 
 /// The direction to one of `count` points spread evenly over the sun's disc (Vogel's spiral).
@@ -43,9 +43,10 @@ pub fn sun_direction(index: usize, count: usize) -> DVec3 {
     (towards + offset.x * right + offset.y * towards.cross(right)).normalize()
 }
 
-/// The share of the sky's light that reaches a surface, in 0..=1: ambient occlusion.
+/// The share of the sky's light that arrives at a surface, in 0..=1: ambient occlusion.
 ///
-/// Samples the distance field along the normal: where it grows more slowly than the distance walked, something is near.
+/// It samples the distance field along the normal. If the field grows more slowly than the distance from the surface,
+/// something is near.
 pub fn openness(bvh: &Bvh, point: DVec3, normal: DVec3) -> f64 {
     let occlusion = OCCLUDERS.map(|(reach, weight)| {
         let distance = bvh.distance(point + reach * normal, reach).max(0.0);
@@ -54,8 +55,8 @@ pub fn openness(bvh: &Bvh, point: DVec3, normal: DVec3) -> f64 {
     1.0 - occlusion.iter().sum::<f64>()
 }
 
-/// The light that a surface sends back along a ray, linear RGB, with the sun a point in direction `sun` and the sky's
-/// light dimmed by `openness`. `occluded` says whether anything stands in the way of a ray.
+/// The light that a surface reflects along a ray, linear RGB. The sun is a point in the direction `sun`, and the sky is
+/// dimmed by `openness`. `occluded` returns true if a ray is blocked.
 pub fn radiance(
     occluded: impl Fn(&Ray) -> bool,
     material: &Material,
@@ -123,13 +124,13 @@ mod tests {
     }
 
     #[test]
-    fn highlight_moves_with_the_viewer() {
+    fn highlight_depends_on_the_viewer() {
         let mirror = DVec3::new(-SUN.x, -SUN.y, SUN.z).normalize();
         let (facing, away) = (seen_from(mirror, 0.3), seen_from(SUN.normalize(), 0.3));
         assert!(facing.min_element() > away.max_element() + 0.3, "{facing} against {away}");
     }
 
-    /// The sun's specular reflection loses no more light than it receives: its integral over the viewers is below 1.
+    /// The sun's specular reflection conserves energy: its integral over the viewers is below 1.
     #[test]
     fn highlight_conserves_energy() {
         let n = 400;
@@ -175,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn the_sun_is_a_disc() {
+    fn sun_directions_fill_a_disc() {
         let directions: Vec<_> = (0..64).map(|i| sun_direction(i, 64)).collect();
         assert!(directions.iter().all(|d| (d.length() - 1.0).abs() < 1e-12));
         assert!(directions.iter().all(|d| d.angle_between(SUN) < SUN_RADIUS));

@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3, Vec3Swizzles};
 
 use raygrad_nerf::Ray;
 
-/// What a ray is traced against.
+/// A surface for ray tracing.
 pub trait Surface {
     /// Where a ray first crosses the surface: its distance, positive, and the outward unit normal. A ray that starts
     /// inside meets the surface where it leaves.
@@ -74,13 +74,13 @@ pub enum Profile {
 pub struct Shape {
     /// The direction of extrusion.
     pub axis: Axis,
-    /// Where the solid begins and ends along the axis.
+    /// The range of the solid along the axis.
     pub span: [f64; 2],
     /// Its cross section.
     pub profile: Profile,
 }
 
-/// The part of a line inside a convex region: where it enters and leaves, with outward normals of any length.
+/// The part of a line inside a convex region: the entry and the exit, with outward normals of any length.
 struct Chord {
     enter: (f64, DVec3),
     leave: (f64, DVec3),
@@ -89,9 +89,9 @@ struct Chord {
 impl Chord {
     /// Keeps the part on the inner side of the plane that the line crosses at `gap / speed`.
     ///
-    /// `gap` is the distance from the ray's origin to the plane along the outward normal `normal()`, and `speed` the
-    /// component of the ray's direction along it. Returns false when nothing is left. A line parallel to the plane
-    /// (a speed of +0 or -0) is inside or outside as a whole: dividing would give NaN for an origin on the plane.
+    /// `gap` is the distance from the ray's origin to the plane along the outward normal `normal()`. `speed` is the
+    /// component of the ray's direction along it. Returns false if nothing remains. A line parallel to the plane (a
+    /// speed of +0 or -0) is entirely inside or outside: dividing would give NaN for an origin on the plane.
     fn clip(&mut self, gap: f64, speed: f64, normal: impl Fn() -> DVec3) -> bool {
         if speed == 0.0 {
             return gap >= 0.0;
@@ -143,7 +143,7 @@ impl Shape {
 }
 
 impl Surface for Shape {
-    /// A ray that runs within a face touches the solid.
+    /// A ray within a face hits the solid.
     fn intersect(&self, ray: &Ray) -> Option<(f64, DVec3)> {
         let axis = self.axis;
         let (o, o_along) = axis.split(ray.origin);
@@ -211,7 +211,7 @@ fn edges(corners: &[DVec2]) -> impl Iterator<Item = (DVec2, DVec2)> {
     corners.iter().zip(next).map(|(a, b)| (*a, *b))
 }
 
-/// The distance to a region that is the product of two, from the signed distances to each.
+/// The distance to the product of two regions, from the signed distances to each.
 fn outside([a, b]: [f64; 2]) -> f64 {
     DVec2::new(a.max(0.0), b.max(0.0)).length() + a.max(b).min(0.0)
 }
@@ -229,7 +229,7 @@ pub(crate) mod tests {
         prop::array::uniform3(-3.0..3.0f64).prop_map(DVec3::from)
     }
 
-    /// Rays from anywhere in (-3, 3)^3; one in three runs along an axis.
+    /// Rays from anywhere in (-3, 3)^3; one in three is parallel to an axis.
     pub(crate) fn ray() -> impl Strategy<Value = Ray> {
         let oblique = vector().prop_filter("no direction", |d| d.length() > 0.1).prop_map(DVec3::normalize);
         let axes = [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z];
@@ -237,7 +237,7 @@ pub(crate) mod tests {
         (vector(), direction).prop_map(|(origin, direction)| Ray { origin, direction })
     }
 
-    /// Every kind of profile along every axis, about 2 in size and near the origin.
+    /// Every profile along every axis, about 2 in size and near the origin.
     fn shape() -> impl Strategy<Value = Shape> {
         let rectangle = (-1.0..0.0f64, -1.0..0.0f64, 0.2..1.0f64, 0.2..1.0f64)
             .prop_map(|(a, b, c, d)| Profile::Rectangle { min: DVec2::new(a, b), max: DVec2::new(c, d) });
@@ -259,7 +259,7 @@ pub(crate) mod tests {
 
     proptest! {
         #[test]
-        fn hits_are_the_first_point_on_the_surface(shape in shape(), ray in ray()) {
+        fn shape_hit_is_the_first_surface_point(shape in shape(), ray in ray()) {
             let hit = shape.intersect(&ray);
             let inside = shape.distance(ray.origin) < 0.0;
             if let Some((t, normal)) = hit {
@@ -267,10 +267,10 @@ pub(crate) mod tests {
                 prop_assert!(t > 0.0 && shape.distance(point).abs() < 1e-9);
                 prop_assert!((normal.length() - 1.0).abs() < 1e-12);
                 prop_assert!((normal.dot(ray.direction) > 0.0) == inside);
-                // The surface of a convex solid is nowhere nearer to a point straight above it.
+                // The surface of a convex solid is nowhere closer to a point above it.
                 prop_assert!((shape.distance(point + 0.5 * normal) - 0.5).abs() < 1e-7);
             }
-            // Up to the hit, or for ever, the ray stays on the side where it starts.
+            // Up to the hit, or without end, the ray stays on its side of the surface.
             let end = hit.map_or(10.0, |(t, _)| t);
             for i in 0..200 {
                 let distance = shape.distance(ray.at(end * i as f64 / 200.0));
@@ -280,30 +280,30 @@ pub(crate) mod tests {
         }
 
         #[test]
-        fn distance_is_that_of_the_nearest_point(shape in shape(), point in vector(), other in vector()) {
+        fn shape_distance_is_to_the_nearest_point(shape in shape(), point in vector(), other in vector()) {
             let distance = shape.distance(point);
-            // No surface point is nearer: rays from the point in all directions meet it at `distance` or later ...
+            // No surface point is nearer: rays from the point in all directions hit at `distance` or later ..
             let direction = (other - point).normalize();
             if let Some((t, _)) = shape.intersect(&Ray { origin: point, direction }) {
                 prop_assert!(t >= distance.abs() - 1e-9);
             }
-            // ... and one lies there, straight down the gradient of the distance.
+            // .. and one is there, along the gradient of the distance.
             let step = 1e-6;
             let slope = |e: DVec3| (shape.distance(point + step * e) - shape.distance(point - step * e)) / (2.0 * step);
             let gradient = DVec3::new(slope(DVec3::X), slope(DVec3::Y), slope(DVec3::Z));
-            // Inside, the gradient breaks where two faces are equally near.
+            // Inside, the gradient is undefined where two faces are equally near.
             if distance > 0.0 || (gradient.length() - 1.0).abs() < 1e-6 {
                 prop_assert!(shape.distance(point - distance * gradient).abs() < 1e-4);
             }
         }
 
         #[test]
-        fn bounds_are_tight(shape in shape()) {
+        fn shape_bounds_are_tight(shape in shape()) {
             let [min, max] = shape.bounds();
             let middle = (min + max) / 2.0;
             for axis in [DVec3::X, DVec3::Y, DVec3::Z] {
                 let half = (max - min).dot(axis) / 2.0;
-                // Each face of the box touches the solid somewhere.
+                // Each face of the box touches the solid.
                 let [u, v] = [axis.yzx(), axis.zxy()].map(|side| (max - min) * side / 100.0);
                 for side in [-1.0, 1.0] {
                     let face = middle + side * half * axis;
@@ -315,7 +315,7 @@ pub(crate) mod tests {
         }
 
         #[test]
-        fn a_square_polygon_is_a_box(ray in ray()) {
+        fn square_polygon_equals_a_box(ray in ray()) {
             let square = Shape { axis: Axis::Z, span: [-1.0, 1.0], profile: Profile::Polygon(UNIT.to_vec()) };
             let cube = Shape::cuboid(DVec3::NEG_ONE, DVec3::ONE);
             prop_assert!((square.distance(ray.origin) - cube.distance(ray.origin)).abs() < 1e-12);
@@ -327,7 +327,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn known_distances() {
+    fn shape_distances_are_known() {
         let cube = Shape::cuboid(DVec3::ZERO, DVec3::splat(2.0));
         let cylinder = Shape::cylinder(Axis::X, DVec3::ZERO, 1.0, 2.0);
         let corners = [[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]].map(DVec2::from).to_vec();
@@ -339,7 +339,7 @@ pub(crate) mod tests {
             (&cylinder, [1.0, 0.0, 3.0], 2.0),
             (&cylinder, [5.0, 0.0, 5.0], 5.0),
             (&cylinder, [0.75, 0.1, 0.0], -0.75),
-            // Along y the profile lies in the plane (z, x): z up to 3, x up to 4.
+            // Along y the profile is in the plane (z, x): z up to 3, x up to 4.
             (&wedge, [4.0, 0.5, 3.0], 2.4),
             (&wedge, [1.0, 0.5, 1.0], -0.5),
         ] {
@@ -347,9 +347,9 @@ pub(crate) mod tests {
         }
     }
 
-    /// Rays that start on the plane of a face and run within it touch the solid, whatever the sign of the zeros.
+    /// Rays within the plane of a face hit the solid, for either sign of zero.
     #[test]
-    fn zero_direction_components() {
+    fn shape_hits_rays_within_faces() {
         let cube = Shape::cuboid(DVec3::NEG_ONE, DVec3::ONE);
         let square = Shape { profile: Profile::Polygon(UNIT.to_vec()), ..cube.clone() };
         let tube = Shape::cylinder(Axis::Z, DVec3::NEG_Z, 1.0, 2.0);

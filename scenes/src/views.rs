@@ -30,9 +30,9 @@ pub fn test_cameras(count: usize, size: usize) -> Vec<Camera> {
     (0..count).map(|i| camera(i as f64 / count as f64 * TAU, ORBIT_ELEVATION.sin(), size)).collect()
 }
 
-/// Points of a golden-angle spiral: bands of equal height have equal area on a sphere.
+/// Points on a golden-angle spiral: bands of equal height have equal area on a sphere.
 ///
-/// `shift` in 0..1 places each point within its band and `turn` rotates the spiral, in radians.
+/// `shift` in 0..1 places each point within its band, and `turn` rotates the spiral, in radians.
 fn spiral(count: usize, size: usize, shift: f64, turn: f64) -> Vec<Camera> {
     (0..count).map(|i| camera(turn + i as f64 * GOLDEN_ANGLE, (i as f64 + shift) / count as f64, size)).collect()
 }
@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn no_two_views_are_the_same() {
+    fn views_are_distinct() {
         for [train, val, test] in (1..60).map(|n| [n; 3]).chain([[60, 10, 20], [100, 100, 200]]) {
             let cameras = [train_cameras(train, 8), val_cameras(val, 8), test_cameras(test, 8)].concat();
             for (i, a) in cameras.iter().enumerate() {

@@ -10,8 +10,8 @@ use raygrad_nerf::dataset::Split;
 
 /// Horizontal field of view in radians.
 const ANGLE_X: f64 = PI / 3.0;
-/// Once around the bulldozer each: the height of the camera over the ground, its distance from the vertical axis, and
-/// the height over the ground of the point of that axis at which it aims, in scene units.
+/// One lap around the bulldozer each, in scene units: the camera's height above the ground, its distance from the
+/// vertical axis, and the height of the point of that axis it looks at.
 const LAPS: [[f64; 3]; 3] = [[0.65, 3.75, 0.7], [1.45, 4.1, 0.85], [2.4, 4.2, 1.0]];
 /// Number of training images.
 const TRAIN: usize = 100;
@@ -29,12 +29,12 @@ pub fn walk_cameras(split: Split, width: usize) -> Vec<Camera> {
     ways.into_iter().map(|way| camera(way / TRAIN as f64, width)).collect()
 }
 
-/// The camera after a share of the way in 0..1. A hand sways: sines of unrelated periods, in views.
+/// The camera at a share of the way, 0..1. The sway of the hand is a sum of sines with unrelated periods, in views.
 fn camera(way: f64, width: usize) -> Camera {
     let laps = LAPS.len() as f64 * way;
     let lap = (laps as usize).min(LAPS.len() - 1);
     let [from, to] = [lap, (lap + 1).min(LAPS.len() - 1)].map(|lap| DVec3::from(LAPS[lap]));
-    // Towards the end of a lap the photographer moves on to the next.
+    // Towards the end of a lap the camera moves to the next one.
     let [height, distance, aim] = from.lerp(to, ((laps.fract() - 0.8) / 0.2).max(0.0)).to_array();
     let sway = |period: f64| (TAU * way * TRAIN as f64 / period).sin();
     let azimuth = TAU * laps;
@@ -65,7 +65,7 @@ mod tests {
             let (height, distance) = (eye.z - GROUND, eye.distance(DVec3::ZERO));
             assert!((0.5..=3.0).contains(&height) && (3.5..=5.0).contains(&distance), "{height} {distance}");
             assert_eq!([camera.width, camera.height], [400, 300]);
-            // Three quarters of the half angle, upright but for some roll.
+            // Three quarters of the half angle; upright except for some roll.
             assert!((camera.focal[0] - 200.0 / (PI / 6.0).tan()).abs() < 1e-9 && camera.focal[0] == camera.focal[1]);
             assert!(camera.pose.matrix3.x_axis.z.abs() < 0.06 && camera.pose.matrix3.y_axis.z > 0.9);
         }
@@ -82,7 +82,7 @@ mod tests {
                 let point = DVec3::new(pick(0), pick(1), pick(2));
                 let [x, y] = camera.pixel_of(point).unwrap();
                 assert!((0.0..400.0).contains(&x) && (0.0..300.0).contains(&y), "{x} {y} of {point}");
-                // The box of the bulldozer is the first thing on the way to its corners, or it is missed closely.
+                // On the way to the box's corners the first hit is the box, or it is missed closely.
                 let way = point - eye;
                 let hit = landscape.trace(&Ray { origin: eye, direction: way.normalize() });
                 assert!(hit.is_none_or(|hit| hit.distance > way.length() - 2.9), "{hit:?} on the way to {point}");

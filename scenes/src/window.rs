@@ -1,4 +1,4 @@
-//! Forward-facing cameras before the bulldozer in the landscape.
+//! Forward-facing cameras in front of the bulldozer in the landscape.
 
 use std::f64::consts::PI;
 
@@ -10,9 +10,9 @@ use raygrad_nerf::dataset::Split;
 
 /// Horizontal field of view in radians.
 const ANGLE_X: f64 = PI / 3.0;
-/// Training images, from left to right and from below upwards.
+/// Training images, from left to right and from bottom to top.
 const TRAIN: [usize; 2] = [6, 5];
-/// Distance between neighbouring cameras, in scene units.
+/// The distance between neighbouring cameras, in scene units.
 const APART: [f64; 2] = [0.3, 0.25];
 
 /// Returns the cameras of a split of [`landscape_ahead`](crate::landscape_ahead): 30 training, 3 validation or 6 test
@@ -30,7 +30,7 @@ pub fn window_cameras(split: Split, width: usize) -> Vec<Camera> {
     places.into_iter().map(|place| camera(place, width)).collect()
 }
 
-/// The camera at a place of the lattice.
+/// The camera at a position of the lattice.
 fn camera([column, row]: [f64; 2], width: usize) -> Camera {
     let shake = |a: f64, b: f64| (a * column + b * row + a * b).sin();
     let side = (column - 0.5 * (TRAIN[0] - 1) as f64) * APART[0] + 0.1 * shake(1.7, 2.3);
@@ -49,7 +49,7 @@ mod tests {
     use raygrad_nerf::Ndc;
 
     #[test]
-    fn window_test_cameras_stand_between_train_cameras() {
+    fn window_test_cameras_are_between_train_cameras() {
         assert_eq!(Split::ALL.map(|split| window_cameras(split, 8).len()), [30, 3, 6]);
         let [low, high] = Landscape::new().bulldozer_bounds();
         let train = window_cameras(Split::Train, 400);
@@ -60,7 +60,7 @@ mod tests {
             let near = |other: &&Camera| other.pose.translation.distance(camera.pose.translation) < 0.45;
             assert!(train.iter().filter(near).count() >= 3, "{}", camera.pose.translation);
         }
-        // They look ahead, and are not far behind their picture's eye.
+        // The cameras look ahead and are close to the frustum's eye.
         let near = Ndc::around(&train, 0.5).unwrap().near;
         assert!((1.0..3.0).contains(&near), "{near}");
     }

@@ -1,4 +1,4 @@
-//! Captures whose files are damaged: what is accepted can be used. A step is trained on it, and a view is rendered.
+//! Accepted captures with damaged files are usable: a training step and a render succeed.
 
 use proptest::prelude::*;
 use raygrad_nerf::dataset::formats::{blender, colmap, llff, transforms};
@@ -14,10 +14,10 @@ use std::cell::Cell;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Photographs of a capture.
+/// Images of a capture.
 const VIEWS: usize = 5;
 
-/// A capture of grey photographs, which are written, with names that begin like that.
+/// Writes a capture of grey images whose names begin with `prefix`.
 fn capture(folder: &Path, prefix: &str) -> Capture {
     std::fs::create_dir_all(folder.join("images")).unwrap();
     let view = |i: usize| {
@@ -50,7 +50,7 @@ fn capture(folder: &Path, prefix: &str) -> Capture {
     }
 }
 
-/// Files of a format, which are damaged one at a time.
+/// Files of a format; one at a time is damaged.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Kind {
     Transforms,
@@ -62,7 +62,7 @@ enum Kind {
 }
 
 impl Kind {
-    /// Writes a capture; gives the files of this kind.
+    /// Writes a capture; returns the files of this kind.
     fn write(self, folder: &Path) -> Vec<PathBuf> {
         let prefix = if matches!(self, Kind::Transforms | Kind::Ply | Kind::Blender) { "images/" } else { "" };
         let capture = capture(folder, prefix);
@@ -85,7 +85,7 @@ impl Kind {
     }
 }
 
-/// An object of one member takes 7 bytes of a document and some 600 of memory; the rest of a capture is small.
+/// An object of one member takes 7 bytes of a document and about 600 of memory. The rest of a capture is small.
 const BOUND: Bound = Bound { times: 256, plus: 1 << 18 };
 
 /// The smallest model.
@@ -97,11 +97,11 @@ fn tiny() -> Config {
     config
 }
 
-/// What became of a damaged capture: it was trained on for a step, and the first of its cameras rendered.
+/// The results of a training step on a damaged capture, and a render by its first camera.
 struct Outcome {
     loss: f64,
     view: Image,
-    /// That of the camera.
+    /// The camera's size.
     size: [usize; 2],
 }
 
@@ -112,20 +112,20 @@ impl Outcome {
     }
 }
 
-/// Where the cameras and points of a capture are, and where its scene lies.
+/// Reads and analyses a capture.
 fn read(folder: &Path) -> Result<(Capture, SceneAnalysis)> {
     let capture = Capture::read(folder)?;
     let survey = capture.analyze_scene(None)?;
     Ok((capture, survey))
 }
 
-/// Trains one step on what was read, and renders a view.
+/// Trains one step on a capture and renders it.
 fn used((capture, survey): &(Capture, SceneAnalysis)) -> Result<Outcome> {
     let data = capture.load(Split::Train, survey, &LoadOptions::default())?;
     let mut config = tiny().with_scene_type(data.scope);
     let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
     (sampler.samples, sampler.occupancy.resolution) = (256, 16);
-    // Long steps: how many samples a ray has proves nothing here.
+    // Long steps save time: the number of samples per ray does not matter here.
     (sampler.step, sampler.view_step) = (0.25, 0.25);
     let camera = data.frames[0].camera.clone();
     let mut trainer = Trainer::new(config, Arc::new(data))?;
@@ -133,18 +133,19 @@ fn used((capture, survey): &(Capture, SceneAnalysis)) -> Result<Outcome> {
     Ok(Outcome { loss, view: trainer.model.render(&camera, [1.0; 3]).color, size: [camera.width, camera.height] })
 }
 
-/// Damage that leaves a file a file, as often as not: digits for digits, and other bytes.
+/// Damage that often leaves a file valid: digits for digits, and a few other bytes.
 fn light() -> impl Strategy<Value = Vec<Damage>> {
     let one = (0.0..1.0_f64, prop_oneof![4 => b'0'..=b'9', 1 => any::<u8>()]);
     prop::collection::vec(one.prop_map(|(at, byte)| Damage::Set(at, byte)), 1..3)
 }
 
-/// Of more accepted captures than this one in a hundred is used, so that a million of each format can be tried in an hour.
+/// Of the accepted captures after this many, one in a hundred is used. A million of each format then take about an
+/// hour.
 const ALL_USED: u64 = 5_000;
 
-/// Tries damaged files of a kind.
+/// Tests damaged files of a kind.
 fn campaign(kind: Kind) {
-    // Its memory is that of one thread.
+    // One thread, so that the memory can be measured.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     pool.install(|| damage_again_and_again(kind));
 }
@@ -164,7 +165,7 @@ fn damage_again_and_again(kind: Kind) {
         let (file, other) = (file.index(files.len()), other.get(&whole));
         let bytes = damaged(&whole[file], other, &damage);
         std::fs::write(&files[file], &bytes).unwrap();
-        // The other files are read too.
+        // All other files are read too.
         let length = whole.iter().map(Vec::len).sum::<usize>() + bytes.len();
         let captured = tally.parse(length, BOUND, || read(folder));
         let [accepted, _] = tally.counts();
@@ -220,9 +221,9 @@ fn campaign_llff() {
     campaign(Kind::Llff);
 }
 
-/// Counts and sizes that no memory holds.
+/// Counts and sizes that no memory could hold.
 #[test]
-fn captures_announcing_huge_sizes_are_refused() {
+fn captures_announcing_huge_sizes_are_errors() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let refused = |kind: Kind, file: usize, change: &(dyn Fn(&mut Vec<u8>) + Sync)| {
         let folder = tempfile::tempdir().unwrap();
@@ -242,7 +243,7 @@ fn captures_announcing_huge_sizes_are_refused() {
         for file in 0..3 {
             refused(Kind::ColmapBinary, file, &|bytes| bytes[..8].copy_from_slice(&count.to_le_bytes()));
         }
-        // Observations of the first image; then a name of no end.
+        // The observations of the first image; then an endless name.
         refused(Kind::ColmapBinary, 1, &|bytes| {
             let end = 8 + 64 + bytes[72..].iter().position(|byte| *byte == 0).unwrap() + 1;
             bytes[end..end + 8].copy_from_slice(&count.to_le_bytes());
@@ -250,7 +251,7 @@ fn captures_announcing_huge_sizes_are_refused() {
         refused(Kind::Ply, 0, &|bytes| replace(bytes, "element vertex 40", &format!("element vertex {count}")));
         refused(Kind::Llff, 0, &|bytes| replace(bytes, "(5, 17)", &format!("({count}, 17)")));
         refused(Kind::Llff, 0, &|bytes| replace(bytes, "(5, 17)", &format!("({count}, {count})")));
-        // Of some width, there may be such a photograph.
+        // Smaller widths may be valid.
         if count > 1 << 24 {
             refused(Kind::Transforms, 0, &|bytes| replace(bytes, "\"w\": 8", &format!("\"w\": {count}")));
         }

@@ -1,13 +1,13 @@
-//! Lenses against OpenCV and COLMAP, and there and back over whole images.
+//! Lenses compared with OpenCV and COLMAP, and round trips over whole images.
 
 use proptest::prelude::*;
 use raygrad_nerf::glam::{DAffine3, DVec3};
 use raygrad_nerf::{Camera, Lens};
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// A pixel's part that pixels agree to.
+/// The tolerance of pixels.
 const PIXEL: f64 = 1e-6;
-/// The focal length that the round trips are measured with.
+/// The focal length of the round trips.
 const FOCAL: f64 = 1000.0;
 
 fn brown(k: &[f64], p: [f64; 2]) -> Lens {
@@ -20,7 +20,7 @@ fn fisheye(k: [f64; 4], p: [f64; 2], s: [f64; 2]) -> Lens {
     Lens::Fisheye { k, p, s }
 }
 
-/// The lens of the capture of a fox that instant-ngp comes with.
+/// The lens of instant-ngp's fox capture.
 fn fox() -> Lens {
     brown(&[0.0578421, -0.0805099], [-0.000980296, 0.00015575])
 }
@@ -45,14 +45,14 @@ struct Case {
 }
 
 #[test]
-fn pixels_are_those_of_opencv_and_colmap() {
+fn pixels_equal_opencv_and_colmap() {
     let reference: Reference = serde_json::from_str(include_str!("../reference/lenses.json")).unwrap();
     assert!(reference.cases.len() > 15);
     for Case { library, model, lens, focal, centre, rows } in reference.cases {
         let camera = Camera { width: 1500, height: 2000, focal, centre, lens, pose: DAffine3::IDENTITY };
         for [x, y, z, column, row] in rows {
             let what = format!("{library} {model} {lens:?} at {x} {y} {z}");
-            // The axes of cameras are those of OpenGL.
+            // Cameras have OpenGL's axes.
             let point = DVec3::new(x, -y, -z);
             let pixel = camera.pixel_of(point).unwrap_or_else(|| panic!("{what}: no pixel"));
             assert!(distance(pixel, [column, row]) < PIXEL, "{what}: {pixel:?}, not {column} {row}");
@@ -63,7 +63,7 @@ fn pixels_are_those_of_opencv_and_colmap() {
     }
 }
 
-/// Lenses, and whether each fills an image of 1500 by 2000 pixels at a focal length of 1000.
+/// Lenses, with true for those that fill an image of 1500 by 2000 pixels at a focal length of 1000.
 fn lenses() -> Vec<(Lens, bool)> {
     vec![
         (Lens::Pinhole, true),
@@ -90,7 +90,7 @@ fn lenses() -> Vec<(Lens, bool)> {
 }
 
 #[test]
-fn whole_images_there_and_back() {
+fn image_points_round_trip() {
     for (lens, filled) in lenses() {
         let (mut seen, mut dark) = (0, 0);
         for row in (0..=2000).step_by(40) {
@@ -101,7 +101,7 @@ fn whole_images_there_and_back() {
                 let Some(direction) = lens.direction(place) else {
                     dark += 1;
                     let outermost = lens.place(nearest * 0.3);
-                    // Square to the axis, where these end, nothing is in front.
+                    // The outermost direction of a FOV lens is at a right angle to the axis, so it does not project.
                     assert!(outermost.is_some() || matches!(lens, Lens::Fov { .. }), "{lens:?}: {place:?} {nearest}");
                     continue;
                 };
@@ -116,7 +116,7 @@ fn whole_images_there_and_back() {
 }
 
 #[test]
-fn whole_views_there_and_back() {
+fn directions_round_trip() {
     for (lens, _) in lenses() {
         let mut seen = 0;
         for ring in 0..150 {
@@ -127,7 +127,7 @@ fn whole_views_there_and_back() {
                 let Some(place) = lens.place(2.0 * toward(angle)) else {
                     continue;
                 };
-                // Beside the fold many directions have one place, and a pinhole's places run away.
+                // Near a fold many directions project to one point, and a pinhole's points diverge.
                 if lens.place(toward(angle + 0.01)).is_none() || place[0].hypot(place[1]) > 1e3 {
                     continue;
                 }
@@ -142,7 +142,7 @@ fn whole_views_there_and_back() {
 }
 
 #[test]
-fn the_fox_is_as_it_was() {
+fn fox_lens_round_trips_and_distorts() {
     let camera = Camera {
         width: 1080,
         height: 1920,
@@ -157,14 +157,14 @@ fn the_fox_is_as_it_was() {
         let ray = camera.ray(x, y);
         assert!(distance(camera.pixel_of(ray.at(2.0)).unwrap(), [x, y]) < PIXEL);
     }
-    // Not a pinhole: the corner is pixels away.
+    // The lens distorts: the corner moves by some pixels.
     let pinhole = Camera { lens: Lens::Pinhole, ..camera.clone() };
     let moved = distance(pinhole.pixel_of(camera.ray(0.5, 0.5).at(1.0)).unwrap(), [0.5, 0.5]);
     assert!((1.0..60.0).contains(&moved), "{moved}");
 }
 
 #[test]
-fn nothing_lies_beyond_a_fold() {
+fn points_beyond_a_fold_have_no_direction() {
     // r (1 - r^2 / 2) is at most (2/3)^(3/2), at sqrt(2/3).
     let (lens, most) = (brown(&[-0.5], [0.0; 2]), (2.0_f64 / 3.0).powf(1.5));
     assert!((most - 0.5443311).abs() < 1e-7);
@@ -179,7 +179,7 @@ fn nothing_lies_beyond_a_fold() {
     assert_eq!(lens.place(DVec3::new(0.9, 0.0, 1.0)), None, "beyond the fold");
     assert_eq!(lens.place(DVec3::new(0.1, 0.0, -1.0)), None, "behind");
     assert_eq!(Lens::Pinhole.place(DVec3::new(0.1, 0.0, -1.0)), None, "behind");
-    // The slope 1 - .9 s + .35 s^2 has no root: this lens puts something everywhere.
+    // The slope 1 - 0.9 s + 0.35 s^2 has no root, so every point has a direction.
     let wide = brown(&[-0.3, 0.07], [0.0; 2]);
     for r in [0.1, 1.0, 3.0, 40.0] {
         let direction = wide.direction([r, 0.0]).unwrap();
@@ -188,7 +188,7 @@ fn nothing_lies_beyond_a_fold() {
 }
 
 #[test]
-fn a_fisheye_sees_behind_itself() {
+fn fisheye_sees_behind_the_camera() {
     let lens = fisheye([0.0; 4], [0.0; 2], [0.0; 2]);
     for (angle, place) in [(1.0, [1.0, 0.0]), (2.0, [0.0, 2.0]), (3.1, [-3.1, 0.0])] {
         let direction = lens.direction(place).unwrap();
@@ -202,7 +202,7 @@ fn a_fisheye_sees_behind_itself() {
 }
 
 #[test]
-fn a_field_of_view_of_zero_is_a_pinhole() {
+fn fov_lens_of_omega_zero_is_a_pinhole() {
     for omega in [0.0, 1e-300, 1e-160, 1e-12, -1e-12, 1e-9] {
         let lens = Lens::Fov { omega };
         for (x, y) in [(0.3, -0.2), (1e-9, 1e-12), (5.0, 7.0)] {
@@ -214,7 +214,7 @@ fn a_field_of_view_of_zero_is_a_pinhole() {
             );
         }
     }
-    // Even in omega, and square to the axis at pi / (2 omega).
+    // Even in omega, and at a right angle to the axis at pi / (2 omega).
     let (one, other) = (Lens::Fov { omega: 0.9 }, Lens::Fov { omega: -0.9 });
     assert_eq!(one.direction([0.7, 0.4]), other.direction([0.7, 0.4]));
     let edge = FRAC_PI_2 / 0.9;
@@ -223,7 +223,7 @@ fn a_field_of_view_of_zero_is_a_pinhole() {
 }
 
 #[test]
-fn a_panorama_has_every_direction_once() {
+fn equirectangular_covers_all_directions() {
     let lens = Lens::Equirectangular;
     for (place, direction) in [
         ([0.0, 0.0], DVec3::Z),
@@ -243,7 +243,7 @@ fn a_panorama_has_every_direction_once() {
 }
 
 #[test]
-fn coefficients_come_and_go() {
+fn coefficients_round_trip_and_are_checked() {
     for (lens, _) in lenses() {
         let coefficients = lens.coefficients();
         assert_eq!(lens.with_coefficients(&coefficients), lens);
@@ -263,7 +263,7 @@ fn coefficients_come_and_go() {
     assert!(Lens::Fov { omega: 3.2 }.check().is_err());
 }
 
-/// Numbers of every size.
+/// Numbers of all magnitudes.
 fn number() -> impl Strategy<Value = f64> {
     prop_oneof![
         Just(0.0),
@@ -277,7 +277,7 @@ fn number() -> impl Strategy<Value = f64> {
 
 proptest! {
     #[test]
-    fn what_lenses_say_is_so(c in prop::array::uniform8(number()), x in number(), y in number()) {
+    fn lens_results_are_finite_for_any_numbers(c in prop::array::uniform8(number()), x in number(), y in number()) {
         for lens in [
             Lens::Pinhole,
             Lens::Brown { k: [0.0; 6], p: [0.0; 2] }.with_coefficients(&c),
@@ -303,13 +303,13 @@ proptest! {
     }
 
     #[test]
-    fn radial_lenses_are_undone(k in prop::array::uniform3(-1.0..1.0_f64), share in 0.0..0.999_f64, bent: bool) {
+    fn radial_lenses_round_trip(k in prop::array::uniform3(-1.0..1.0_f64), share in 0.0..0.999_f64, bent: bool) {
         let lens = if bent { fisheye([k[0], k[1], k[2], 0.0], [0.0; 2], [0.0; 2]) } else { brown(&k, [0.0; 2]) };
         let outermost = lens.nearest([1e9, 0.0]);
         let angle = share * outermost.x.atan2(outermost.z).min(1.5);
         let direction = DVec3::new(0.6 * angle.sin(), -0.8 * angle.sin(), angle.cos());
         let again = lens.direction(lens.place(direction).unwrap()).unwrap();
-        // Near the fold many directions have nearly one place.
+        // Near the fold many directions project to nearly one point.
         prop_assert!((again - direction).length() < 1e-14 / (1.0 - share).min(0.01), "{} for {}", again, direction);
     }
 }

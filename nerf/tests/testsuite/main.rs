@@ -1,4 +1,4 @@
-//! What this crate promises from outside.
+//! Tests of the crate's public interface, and of its modules.
 
 mod accepted;
 mod lenses;

@@ -1,9 +1,9 @@
-//! The house has rooms: each knows only those before it, and no two files know each other in a circle.
+//! Layers: a module uses only modules before it, and no files use each other in a cycle.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// The rooms in the order in which data passes them. What stands in one line knows nothing of what stands in a later one.
+/// The modules in the order of the layers. A module uses none of a later line.
 const ROOMS: [&str; 21] = [
     "error",
     "range",
@@ -27,7 +27,7 @@ const ROOMS: [&str; 21] = [
     "geometry",
     "training",
 ];
-/// Files that only gather what others hold.
+/// Files that only collect items of others.
 const GATHERING: [&str; 3] = ["lib.rs", "catalogue.rs", "compiled.rs"];
 
 /// The code of a file without comments and without tests.
@@ -38,7 +38,7 @@ fn code(file: &Path) -> String {
     text.lines().map(|line| line.split("//").next().unwrap()).collect::<Vec<_>>().join("\n")
 }
 
-/// All files that are not tests, by the module that they are: `["space", "occupancy", "march"]`.
+/// All files without tests, by module, such as `["space", "occupancy", "march"]`.
 fn modules(root: &Path) -> BTreeMap<Vec<String>, PathBuf> {
     let (mut found, mut folders) = (BTreeMap::new(), vec![root.to_path_buf()]);
     while let Some(folder) = folders.pop() {
@@ -59,7 +59,7 @@ fn modules(root: &Path) -> BTreeMap<Vec<String>, PathBuf> {
     found
 }
 
-/// The paths that a tree of names after `use` stands for: `a::{b, c::d}` is `a::b` and `a::c::d`.
+/// The paths of a `use` tree: `a::{b, c::d}` is `a::b` and `a::c::d`.
 fn leaves(tree: &str) -> Vec<String> {
     let tree = tree.trim();
     let Some(open) = tree.find('{') else {
@@ -80,13 +80,13 @@ fn leaves(tree: &str) -> Vec<String> {
     parts.flat_map(|part| leaves(part)).map(|leaf| format!("{prefix}{leaf}")).collect()
 }
 
-/// Every path that a file names: in `use` and elsewhere. Names that a file hands on with `pub use` are given apart.
+/// Every path in a file, from `use` and elsewhere. Names of `pub use` are returned separately.
 fn paths(code: &str) -> (Vec<String>, Vec<String>) {
     let (mut own, mut handed, mut rest) = (vec![], vec![], String::new());
     for statement in code.split_inclusive(';') {
         let at = ["pub(crate) use ", "pub use ", "use "].into_iter().filter_map(|word| {
             let at = statement.match_indices(word).map(|(at, _)| at);
-            // At the beginning of a line: in a message it is another word.
+            // Only at the start of a line: elsewhere the word is part of a message.
             let starts = |at: &usize| statement[..*at].trim_end_matches(' ').ends_with('\n') || *at == 0;
             Some((at.into_iter().find(starts)?, word))
         });
@@ -103,10 +103,10 @@ fn paths(code: &str) -> (Vec<String>, Vec<String>) {
     (own, handed)
 }
 
-/// Which file a path leads to: a module or an item of one, from within module `from`.
+/// Resolves paths from within a module to the modules of their items.
 struct House {
     files: BTreeMap<Vec<String>, PathBuf>,
-    /// For each module the names that it hands on from its children.
+    /// For each module, the names that it re-exports from its children.
     handed: BTreeMap<Vec<String>, BTreeMap<String, Vec<String>>>,
 }
 
@@ -125,7 +125,7 @@ impl House {
                     module.pop();
                 }
             }
-            // A child of this module, or nothing of this crate.
+            // A child of this module, or a name of another crate.
             child => {
                 let mut inner = module.clone();
                 inner.push(child.to_owned());
@@ -151,7 +151,7 @@ impl House {
     }
 }
 
-/// For each file those that it uses.
+/// The modules that each module uses.
 fn uses() -> BTreeMap<Vec<String>, BTreeSet<Vec<String>>> {
     let files = modules(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src"));
     let mut house = House { files, handed: BTreeMap::new() };
@@ -173,7 +173,7 @@ fn uses() -> BTreeMap<Vec<String>, BTreeSet<Vec<String>>> {
 }
 
 #[test]
-fn rooms_know_only_those_before_them() {
+fn modules_use_earlier_modules_alone() {
     let place = |module: &[String]| ROOMS.iter().position(|room| *room == module[0]);
     let mut count = 0;
     for (module, targets) in uses() {
@@ -187,9 +187,9 @@ fn rooms_know_only_those_before_them() {
 }
 
 #[test]
-fn no_files_know_each_other_in_a_circle() {
+fn modules_have_no_cycles() {
     let mut uses = uses();
-    // Files that use nothing that is left are no part of a circle.
+    // Modules without uses are in no cycle.
     loop {
         let done: Vec<_> =
             uses.iter().filter(|(_, targets)| targets.is_empty()).map(|(module, _)| module.clone()).collect();
@@ -199,7 +199,7 @@ fn no_files_know_each_other_in_a_circle() {
         uses.retain(|module, _| !done.contains(module));
         uses.values_mut().for_each(|targets| targets.retain(|target| !done.contains(target)));
     }
-    // Nor are those that nothing that is left uses.
+    // Modules without users are in no cycle either.
     loop {
         let used: BTreeSet<_> = uses.values().flatten().cloned().collect();
         let before = uses.len();

@@ -309,6 +309,6 @@ fn march_buffer_is_reusable() {
 
 #[test]
 #[should_panic(expected = "`step.length`: is 0; use a finite length above 0")]
-fn step_of_length_zero_is_an_error() {
+fn step_of_length_zero_panics() {
     march(&random_grid(BOX, 8, 1, 1.0, 0), &one(DVec3::ZERO, DVec3::X, [0.0, 1.0]), &Step::uniform(0.0));
 }
