@@ -254,7 +254,7 @@ mod tests {
     use crate::shape::Surface;
 
     #[test]
-    fn every_view_shows_the_whole_scene() {
+    fn views_show_the_whole_scene() {
         let solids = solids();
         for camera in [train_cameras(60, 100), val_cameras(10, 100), test_cameras(20, 100)].concat() {
             let view = camera.pose.inverse();

@@ -97,7 +97,7 @@ impl<S: Surface> Bvh<S> {
         nearest
     }
 
-    /// Whether a ray meets any surface.
+    /// Returns true if a ray hits any surface.
     pub fn occluded(&self, ray: &Ray) -> bool {
         let mut hit = false;
         self.walk(ray, f64::INFINITY, |_, shape, limit| {

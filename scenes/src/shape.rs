@@ -9,8 +9,8 @@ use raygrad_nerf::Ray;
 
 /// A surface for ray tracing.
 pub trait Surface {
-    /// Where a ray first crosses the surface: its distance, positive, and the outward unit normal. A ray that starts
-    /// inside meets the surface where it leaves.
+    /// The first intersection of a ray with the surface: its distance, positive, and the outward unit normal. A ray
+    /// that starts inside hits the surface at its exit.
     fn intersect(&self, ray: &Ray) -> Option<(f64, DVec3)>;
 
     /// The corners of an axis-aligned box around the shape, preferably the smallest.

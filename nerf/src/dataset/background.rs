@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_over_a_colour_is_rgb() {
+    fn over_returns_rgb() {
         let image = Image { width: 2, height: 1, channels: 4, data: vec![0.5, 0.5, 0.5, 1.0, 0.5, 0.5, 0.5, 0.0] };
         let flat = image.over([0.0, 0.25, 1.0]);
         assert_eq!((flat.width, flat.height, flat.channels), (2, 1, 3));

@@ -18,13 +18,13 @@ const DARK: f64 = 0.01;
 
 /// Measurements of an image.
 pub(super) struct Look {
-    /// Whether some pixel is transparent; `None` without an alpha channel.
+    /// True if a pixel is transparent; `None` without an alpha channel.
     pub transparent: Option<bool>,
     /// Equal for equal images.
     pub hash: u64,
     /// The logarithm of the variance of the Laplacian over the variance of the brightness; `None` of a flat image.
     pub sharpness: Option<f64>,
-    /// The mean logarithm of the brightness of what is there; `None` where nothing is.
+    /// The mean logarithm of the luminance, weighted by alpha; `None` if the image is nearly all transparent.
     pub luminance: Option<f64>,
     /// The logarithms of red and of blue over green, of the means.
     pub balance: [f64; 2],

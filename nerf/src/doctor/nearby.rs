@@ -26,8 +26,8 @@ impl<'a> Nearby<'a> {
         Nearby { places, radius, cells }
     }
 
-    /// The indices of the wanted places at most `radius` from place `i`, including itself, in no particular order.
-    /// Where very many lie around it, the first of them.
+    /// The indices of the wanted points at most `radius` from point `i`, including itself, in no particular order. Of
+    /// very many, only the first are found.
     pub fn of(&self, i: usize) -> impl Iterator<Item = usize> {
         let (place, [x, y, z]) = (self.places[i], cell(self.places[i], self.radius));
         let steps = |at: i64| [at, at.saturating_sub(1), at.saturating_add(1)];

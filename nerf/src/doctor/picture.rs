@@ -25,7 +25,7 @@ pub(super) struct Picture {
     pub centre: [f64; 2],
     /// Row-major; NaN for unknown pixels.
     values: Vec<f32>,
-    /// Where there is something to recognise.
+    /// Positions of corners.
     pub corners: Vec<[f64; 2]>,
 }
 

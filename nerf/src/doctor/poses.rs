@@ -62,7 +62,7 @@ impl Convention {
 /// The point that the cameras look at.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Focus {
-    /// The place nearest to all optical axes, in the sense of least squares.
+    /// The least-squares point nearest to all optical axes.
     pub place: DVec3,
     /// The median distance of the axes from it, as a share of the cameras' distance.
     pub miss: f64,
@@ -73,7 +73,7 @@ pub(super) struct Focus {
 }
 
 impl Focus {
-    /// Of poses in OpenGL's axes; `None` if there are fewer than two or the axes are parallel.
+    /// The focus of poses in OpenGL's axes; `None` if there are fewer than two or the axes are parallel.
     pub fn of(poses: &[DAffine3]) -> Option<Focus> {
         let count = poses.len() as f64;
         let mean = mean(poses.iter().map(|pose| pose.translation));
@@ -90,7 +90,7 @@ impl Focus {
         Some(Focus { place, miss: miss / distance.max(f64::MIN_POSITIVE), ahead, distance })
     }
 
-    /// Whether cameras clearly stand around one thing and look at it.
+    /// Returns true if the cameras clearly surround one place and look at it.
     pub fn is_inward(&self) -> bool {
         self.ahead > 0.9 && self.miss < 0.3
     }

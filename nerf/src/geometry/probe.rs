@@ -26,7 +26,7 @@ impl<'a> Probe<'a> {
         Probe { model, pool: Pool::new(), densities: AtomicU64::new(0), colors: AtomicU64::new(0) }
     }
 
-    /// How often the model was asked so far.
+    /// The number of evaluations of the model so far.
     pub fn evaluations(&self) -> Evaluations {
         let [density, color] = [&self.densities, &self.colors].map(|count| count.load(Ordering::Relaxed));
         Evaluations { density, color, unskipped: 0 }
@@ -38,8 +38,8 @@ impl<'a> Probe<'a> {
         densities(&*self.model.field, &self.model.params, &self.pool, points, out);
     }
 
-    /// The same as pictures have it: 0 outside of the model's box and where the grid, if there is one, is not occupied.
-    /// What is hidden there has an infinite one. Gives the largest of those that are not hidden.
+    /// The densities of renders: 0 outside of the model's box and in empty cells of the grid, if there is one. Hidden
+    /// points get an infinite density. Returns the largest density of the others.
     pub fn shown(
         &self,
         grid: Option<&OccupancyGrid>,

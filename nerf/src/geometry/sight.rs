@@ -30,7 +30,7 @@ pub(super) struct Sight {
 pub(super) struct Seen {
     /// Row by row; `None` for those that see nothing solid.
     pub sights: Vec<Option<Sight>>,
-    /// How often the model was asked.
+    /// The number of evaluations of the model.
     pub evaluations: Evaluations,
 }
 

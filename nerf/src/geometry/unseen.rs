@@ -19,7 +19,7 @@ impl Hidden {
         Hidden { views: views.iter().map(view).collect(), margin }
     }
 
-    /// Whether a point is in the view of a camera, and hidden in every view that it is in.
+    /// Returns true if a point is in the view of a camera, and hidden in every view that contains it.
     pub fn holds(&self, place: DVec3) -> bool {
         let mut behind = false;
         for (camera, distances) in &self.views {

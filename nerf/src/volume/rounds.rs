@@ -41,24 +41,24 @@ pub(crate) struct Round<'t, T: Scalar> {
 }
 
 impl<'a, T: Scalar> FrontToBack<'a, T> {
-    /// Follows rays until no more than `early_stop_eps` of their light is left.
+    /// Follows rays until no more than `termination` of their light is left.
     pub fn new(samples: &'a Samples<T>, termination: f64) -> Self {
         // Without termination, rays end where f64 has no light left.
         let opaque = -termination.max(5e-324).ln();
         FrontToBack { samples, depths: vec![0.0; samples.segments.len()], opaque, passed: 0 }
     }
 
-    /// Whether there is light behind this optical depth.
+    /// Returns true if there is light behind this optical depth.
     pub fn has_light(&self, depth: f64) -> bool {
         depth < self.opaque
     }
 
-    /// Whether no light is left behind this optical depth; false for NaN.
+    /// Returns true if no light is left behind this optical depth; false for NaN.
     pub fn has_ended(&self, depth: f64) -> bool {
         depth >= self.opaque
     }
 
-    /// How many samples each ray takes in a round of views.
+    /// The number of samples per ray in a round of a render.
     pub fn round_size(&self) -> usize {
         (ROUND / self.depths.len().max(1)).max(LEAST)
     }

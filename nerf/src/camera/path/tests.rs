@@ -199,7 +199,7 @@ fn legs_of_tiny_time_are_passed() {
 }
 
 #[test]
-fn keyframe_times_do_not_bend_the_curve() {
+fn keyframe_times_keep_the_curve() {
     // Equal steps along x: the curve's parameter is x.
     let key = |x: f64| Keyframe { pose: DAffine3::from_translation(DVec3::new(x, 1.0, 2.0)), angle_y: 0.8 };
     let keys: Vec<Keyframe> = (0..5).map(|i| key(f64::from(i))).collect();

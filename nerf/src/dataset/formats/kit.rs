@@ -1,4 +1,4 @@
-//! What the tests of JSON formats share.
+//! Helpers for tests of formats.
 
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};

@@ -1,4 +1,4 @@
-//! What no file of a capture has.
+//! Limits for the contents of a capture's files.
 
 /// The most pixels of an image side; more means that the file is damaged.
 pub(super) const MOST_PIXELS: usize = 1 << 24;

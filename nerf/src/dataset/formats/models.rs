@@ -5,14 +5,14 @@ use crate::camera::lens::Lens;
 /// A camera model.
 #[derive(Debug, PartialEq)]
 pub(super) struct Model {
-    /// COLMAP's number, of models that it has.
+    /// COLMAP's number, if COLMAP has the model.
     pub id: Option<i32>,
     pub name: &'static str,
-    /// Whether both axes have one focal length.
+    /// True if both axes share one focal length.
     pub single: bool,
-    /// A lens of its kind that does nothing.
+    /// A lens of the model without distortion.
     pub kind: Lens,
-    /// The coefficients that it has of that kind, in COLMAP's order.
+    /// The model's coefficients of that lens, in COLMAP's order.
     pub coefficients: &'static [&'static str],
 }
 

@@ -20,8 +20,8 @@ pub(in crate::dataset) const MAGIC: &[u8] = b"\x93NUMPY";
 const BROKEN: &str = "is not a complete npy file: copy it again";
 
 impl Matrix {
-    /// The matrix of a `.npy` file of f32 or f64 numbers, in either order of elements; or what is wrong, as the end of
-    /// a sentence that begins with the file's name.
+    /// The matrix of a `.npy` file of f32 or f64 numbers, in either order of elements; or a message that follows the
+    /// file's name.
     pub fn read(bytes: &[u8]) -> Result<Self, String> {
         let (header, data) = split(bytes).ok_or(BROKEN)?;
         let descr = member(header, "descr").ok_or(BROKEN)?.trim_start_matches(['\'', '"']);

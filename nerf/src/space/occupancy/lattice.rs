@@ -48,19 +48,19 @@ impl Lattice {
         (word / self.blocks(), [block % side, block / side % side, block / (side * side)])
     }
 
-    /// How many times larger a word's cells are than those of cascade 0.
+    /// The size of a word's cells, relative to those of cascade 0.
     pub fn enlargement(&self, word: usize) -> f32 {
         (1_u32 << self.place(word).0) as f32
     }
 
-    /// Whether a word's cells are looked at: not if a smaller cascade holds the same part of space.
+    /// Returns true unless a smaller cascade covers the same part of space, so that the word's cells are not in use.
     pub fn is_used(&self, word: usize) -> bool {
         let (cascade, block) = self.place(word);
         let (quarter, side) = (self.side() / 4, self.side());
         cascade == 0 || !block.iter().all(|b| (quarter..side - quarter).contains(b))
     }
 
-    /// Number of cells that are looked at.
+    /// The number of cells in use.
     pub fn used_cells(&self) -> usize {
         let inner = if self.cascades > 1 { (self.side() / 2).pow(3) } else { 0 };
         (self.words() - (self.cascades - 1) * inner) * CELLS

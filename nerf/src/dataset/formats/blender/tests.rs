@@ -51,7 +51,7 @@ fn images_and_cameras_are_read() {
 }
 
 #[test]
-fn all_splits_are_read() {
+fn blender_splits_are_all_read() {
     let folder = folder(|d| d["aabb_scale"] = json!(2));
     let file = |split: &str, text: String| std::fs::write(folder.path().join(format!("transforms_{split}.json")), text);
     file("test", document(&["test/r_0"]).to_string()).unwrap();

@@ -1,4 +1,4 @@
-//! Where the images and masks of a model are.
+//! The images and masks of a model.
 
 use crate::dataset::capture::Capture;
 use std::path::{Path, PathBuf};

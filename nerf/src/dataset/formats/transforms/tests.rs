@@ -250,7 +250,7 @@ fn aabb_scale_is_read_other_fields_are_ignored() {
 }
 
 #[test]
-fn the_fox_is_read() {
+fn transforms_of_instant_ngps_fox_are_read() {
     let fox = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/fox"));
     if !fox.is_dir() {
         println!("skipped: there is no {}", fox.display());
