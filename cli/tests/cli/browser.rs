@@ -1,6 +1,6 @@
-//! The page of `raygrad view` in real browsers: Chromium and Firefox without a window, where they are installed.
+//! The page of `raygrad view` in installed browsers: headless Chromium and Firefox.
 //!
-//! `SHOTS=DIR cargo test --test cli browser` leaves pictures of the page to look at.
+//! `SHOTS=DIR cargo test --test cli browser` saves screenshots of the page.
 
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 #[path = "browser/driver.rs"]
 mod driver;
 
-/// The picture that a page has given as bytes, RGBA.
+/// Decodes an RGBA image that a page returned as bytes.
 fn image(bytes: &Value, [width, height]: [usize; 2]) -> Image {
     let rgba = bytes.as_array().unwrap().chunks(4);
     let data = rgba.flat_map(|rgba| rgba[..3].iter().map(|x| x.as_u64().unwrap() as f32 / 255.0));
@@ -23,7 +23,7 @@ fn image(bytes: &Value, [width, height]: [usize; 2]) -> Image {
 }
 
 #[test]
-fn a_browser_shows_the_scene_and_moves_about_it() {
+fn browser_renders_the_scene_and_moves_the_camera() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 300 --out run {SMALL}"));
     let server = serve(&place, "view run");
@@ -38,7 +38,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
     let expected = png(&place.path(&file));
     assert!(psnr(&first, &expected) > 40.0, "{}", psnr(&first, &expected));
     browser.shot("first");
-    // Whatever moves the camera changes the picture, and R brings it back.
+    // Every camera control changes the image, and R resets it.
     let pose = |browser: &mut Browser| browser.value("JSON.stringify([view.eye, view.back])");
     let mut seen = vec![pose(&mut browser)];
     let away = "Math.hypot(...view.eye.map((x, i) => x - view.pivot[i]))";
@@ -46,7 +46,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
     let azimuth = "Math.atan2(view.eye[1] - view.pivot[1], view.eye[0] - view.pivot[0])";
     let before = browser.value(azimuth).as_f64().unwrap();
     browser.drag([60.0, 20.0], "left");
-    // The scene follows the hand: the camera goes the other way, and up.
+    // The scene follows the pointer: the camera moves in the opposite direction.
     let turned = (browser.value(azimuth).as_f64().unwrap() - before).sin();
     assert!(turned < -0.05, "{turned}");
     assert!((browser.value(away).as_f64().unwrap() - far).abs() < 1e-9 * far, "an orbit keeps its distance");
@@ -70,7 +70,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
     browser.shot("moved");
     browser.key("r");
     browser.rested();
-    // Pieces are as large as there is time for: the last bits differ.
+    // Tiles depend on the available time, so the last bits differ.
     let same = |image: &Image| psnr(image, &first) > 45.0;
     assert!(same(&browser.picture(place)));
     for (key, show) in [("2", "depth"), ("3", "normals"), ("4", "opacity"), ("1", "color")] {
@@ -80,7 +80,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
         browser.shot(show);
         assert_eq!(same(&browser.picture(place)), show == "color", "{show}");
     }
-    // To a photograph and back.
+    // To an image's camera and back.
     browser.key("n");
     browser.rested();
     assert!(browser.value("view.photograph !== null && photo.hidden") == true);
@@ -112,7 +112,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
     browser.rested();
     browser.shot("cropped");
     browser.value("document.getElementById('crop').click()");
-    // The slider goes through checkpoints; letters that are typed in a control are its own.
+    // The slider steps through checkpoints. Keys typed in a control do not act as shortcuts.
     let slide = |browser: &mut Browser, to: u32| {
         let id = "document.getElementById('checkpoint')";
         browser.value(&format!("{id}.focus(); {id}.value = {to}; {id}.dispatchEvent(new Event('input'))"));
@@ -136,7 +136,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
 }
 
 #[test]
-fn browser_saves_images_and_paths_of_the_program() {
+fn browser_saves_images_and_paths() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 60 --out run --scene-type unbounded {SMALL} --set sampler.cone=0.1"));
     let server = serve(&place, "view run");
@@ -148,7 +148,7 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
     browser.key("p");
     let saved = png(&browser.kept("view.png"));
     assert!(psnr(&browser.picture(place), &saved) > 35.0);
-    // Key frames where the camera is at first, and elsewhere; the video begins with what is seen.
+    // Keyframes at the initial camera and elsewhere; the video starts at the current view.
     browser.key("k");
     browser.drag([60.0, -5.0], "left");
     browser.key("k");
@@ -156,7 +156,7 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
     browser.value("document.getElementById('save-path').click()");
     let path = browser.kept("path.json");
     std::fs::copy(path, place.path("path.json")).unwrap();
-    // As large as the window it would take long.
+    // The window's size would take long.
     browser.value("freeSizes = () => [48, 12]; document.getElementById('seconds').value = 0.5; document.getElementById('video').click()");
     browser.until(
         "document.getElementById('video-progress').textContent.endsWith('mp4: done') \
@@ -170,7 +170,7 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
     let size = format!("{}x{}", saved.width, saved.height);
     let rendered =
         place.command(&format!("render run --path path.json --frames 2 --size {size} --out video")).output().unwrap();
-    // It says itself where it lies.
+    // The file names its coordinate transform.
     let said = String::from_utf8_lossy(&rendered.stderr);
     assert!(rendered.status.success() && !said.contains("assuming capture coordinates"), "{said}");
     std::fs::rename(place.path("video"), place.path(&format!("video-{:?}", browser.kind))).unwrap();
@@ -180,7 +180,7 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
     let seen = browser.picture(place);
     assert!(psnr(&seen, &to) > 35.0 && psnr(&seen, &from) < psnr(&seen, &to) - 3.0, "{}", psnr(&seen, &to));
     browser.shot("path");
-    // The path is there when the page is loaded again, and comes back from its file.
+    // The path survives a reload and is restored from its file.
     let there = |browser: &mut Browser, path: &str| {
         browser.value(&format!("JSON.stringify(keys) !== '[]' && size(sub(keys[1].eye, {path}.eye)) + size(sub(keys[1].back, {path}.back)) < 1e-9"))
     };
@@ -200,7 +200,7 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
 }
 
 #[test]
-fn a_browser_reaches_everything_by_its_controls() {
+fn browser_controls_reach_all_functions() {
     let place = Place::empty();
     place.add_landscape();
     let point = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
@@ -217,11 +217,11 @@ fn a_browser_reaches_everything_by_its_controls() {
 fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     browser.visit(server);
     let first = browser.picture(place);
-    // Whoever hears the page rather than sees it knows what each control is for.
+    // Screen readers need an accessible name of each control.
     let unnamed = "[...document.querySelectorAll('input, select, button')].filter((it) => !(it.getAttribute('aria-label') \
                    || (it.labels && [...it.labels].some((label) => label.textContent.trim())) || it.textContent.trim())).map((it) => it.id || it.outerHTML).join()";
     assert_eq!(browser.value(unnamed), "");
-    // Photographs: by name, the next, the one before, around the end.
+    // Images: by name, the next, the previous, wrapping at the end.
     let photograph = "view.photograph";
     let count = browser.number("about.photographs.length");
     let seen = |browser: &mut Browser| browser.value(photograph);
@@ -242,7 +242,7 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     assert_eq!(seen(&mut browser), count - 1.0);
     browser.click("next");
     assert_eq!(seen(&mut browser), 0);
-    // The photograph over the picture, as much as is asked for.
+    // The image overlay, by the blend setting.
     browser.set("blend", 100);
     browser.until("!photo.hidden && photo.style.opacity === '1' && stage.dataset.photograph === '0'");
     let name = browser.value("about.photographs[0].name").as_str().unwrap().to_owned();
@@ -260,7 +260,7 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     assert_eq!(browser.value("photo.hidden"), true);
     browser.set("photograph", "");
     assert_eq!(seen(&mut browser), Value::Null);
-    // From elsewhere, the photograph that is nearest: here the one that was turned away from.
+    // From a free camera, the nearest image: the last one selected.
     browser.set("photograph", "5");
     browser.value("stage.focus()");
     browser.key("Shift+ArrowLeft");
@@ -268,12 +268,12 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     browser.set("blend", 50);
     assert_eq!(seen(&mut browser), 5);
     browser.click("reset");
-    // What comes now is the scripts' own, which are checked part by part in both.
+    // The rest tests scripts, which `page_scripts_pass_their_checks` covers in both browsers.
     if browser.kind == Kind::Firefox {
         assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
         return;
     }
-    // The lens, which frees the camera.
+    // The field of view, which frees the camera.
     browser.set("fov", 90);
     browser.rested();
     assert_eq!(browser.value("[view.fov, document.getElementById('fov-out').textContent].join()"), "90,90°");
@@ -283,7 +283,7 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     browser.until("shown.size[1] * 2 ** shown.halvings >= 400");
     browser.set("size", "fit");
     browser.rested();
-    // What is behind, where a box leaves nothing.
+    // The background shows where the crop box leaves nothing.
     browser.set("crop", true);
     for (number, axis) in ["x", "y", "z"].into_iter().enumerate() {
         let lower = browser.number(&format!("about.bounds[0][{number}]"));
@@ -293,12 +293,12 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     browser.rested();
     let corner = browser.picture(place).data[..3].to_vec();
     assert!(corner.iter().zip([1.0, 0.5, 0.0]).all(|(a, b)| (a - b).abs() < 0.05), "{corner:?}");
-    // Sides of a box do not change places, and each handle moves its own.
+    // The sides of the box keep their order, and each handle moves its own side.
     browser.value("makeBox(); view.fov = 100; settled()");
     for axis in 0..3 {
         for end in 0..2 {
             browser.click("reset");
-            // From the side, and from farther than all of it.
+            // From the side, and from a distance that shows the whole box.
             browser.value(&format!("orbit(0.5, {}), zoom(3), markAll()", if axis == 2 { 0.1 } else { 0.6 }));
             let before = browser.value("box()");
             let at = browser.centre(&format!("marks.querySelectorAll('.handle')[{}]", 2 * axis + end));
@@ -318,7 +318,7 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     }
     browser.set("crop", false);
     browser.click("reset");
-    // Marks.
+    // Markers.
     let marked = |browser: &mut Browser| {
         browser.value(
             "(markAll(), [marks.querySelectorAll('.camera').length, dots.hidden ? 0 : \
@@ -338,7 +338,7 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     let inside = browser.value(&inside) == true;
     assert_eq!(marked(&mut browser), if inside { "0,1" } else { "0,0" });
     browser.set("points", false);
-    // Key frames: gone to, played and removed; a path that is closed leads back.
+    // Keyframes can be visited, played and removed; a closed path returns to its start.
     browser.click("reset");
     for turn in ["0", "0.8", "0.8"] {
         browser.value(&format!("orbit({turn}, 0)"));
@@ -353,7 +353,7 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     browser.set("seconds", 0.5);
     browser.click("play");
     browser.until(&format!("{eye} === '{}'", last.as_str().unwrap()));
-    // Whatever moves the camera ends it.
+    // Every camera control ends the playback.
     browser.set("seconds", 600);
     browser.click("play");
     browser.value("new Promise((done) => setTimeout(done, 100))");
@@ -370,19 +370,19 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     browser.value("document.querySelector('#keys li:nth-child(2) button:last-child').click()");
     assert_eq!(browser.value("[keys.length, document.querySelectorAll('#keys li').length].join()"), "2,2");
     assert_eq!(browser.value("keys[1].eye.map((x) => x.toFixed(6)).join()"), last);
-    // What videos cannot show is said, and that a path has two ends.
+    // The page states the limits of videos, and that a path needs two keyframes.
     browser.set("crop", true);
     browser.value("document.getElementById('box-x-0').value = 1e9");
     browser.click("video");
     browser.until("!$('sorry').hidden && $('sorry').textContent.includes('turn off the crop box')");
     browser.set("crop", false);
     browser.value("document.querySelector('#keys li button:last-child').click()");
-    // It is seen from the bottom of the controls too.
+    // The message is visible at the end of the controls too.
     browser.value("document.querySelector('aside').scrollTo(0, 1e6)");
     browser.click("play");
     browser.until("$('sorry').textContent.includes('two keyframes')");
     assert!(browser.sees("sorry"));
-    // Nothing is painted for a page that nobody sees, and it goes on when it is seen.
+    // A hidden page is not rendered; rendering resumes when it is visible.
     browser.click("reset");
     browser.rested();
     let hide = |browser: &mut Browser, hidden: bool| {
@@ -427,7 +427,7 @@ fn browser_reconnects_and_fits_a_phone() {
     let wide = browser.value("stage.getBoundingClientRect().width").as_f64().unwrap();
     assert!((wide - 390.0).abs() < 1.0, "{wide}");
     browser.shot("phone");
-    // The scene stays in sight while its controls scroll, and what is said of them is seen there.
+    // The scene stays visible while its controls scroll, and so do their messages.
     let stays = "(scrollTo(0, 1e6), (({ top, bottom }) => scrollY > 300 && Math.abs(top) < 1 && bottom < innerHeight)(stage.getBoundingClientRect()))";
     assert_eq!(browser.value(stays), true);
     browser.click("play");
@@ -435,7 +435,7 @@ fn browser_reconnects_and_fits_a_phone() {
     assert!(browser.sees("sorry"));
     browser.shot("scrolled");
     browser.value("scrollTo(0, 0)");
-    // Two fingers that part bring it nearer.
+    // Pinching with two fingers zooms in.
     let away = "Math.hypot(...view.eye.map((x, i) => x - view.pivot[i]))";
     let far = browser.value(away).as_f64().unwrap();
     browser.call("Emulation.setTouchEmulationEnabled", json!({ "enabled": true, "maxTouchPoints": 2 }));
@@ -460,12 +460,12 @@ fn browser_reconnects_and_fits_a_phone() {
 }
 
 #[test]
-fn a_browser_shows_training_and_controls_it() {
+fn browser_shows_and_controls_training() {
     let Some(mut browser) = Browser::open(Kind::Chromium) else { return };
     let place = Place::with_scene();
     let mut server = serve(&place, &format!("--threads 1 train scene --steps 1000000 --view --out run {SMALL}"));
     browser.go(&format!("http://{}/", server.address));
-    // On a busy machine no whole picture comes before training is held.
+    // On a busy machine no complete image arrives before training is paused.
     browser.until("typeof training !== 'undefined' && training !== null && training.step > 20 && shown !== null");
     browser.until("shown.step > 10");
     browser.value("document.getElementById('pause').click()");
@@ -489,9 +489,10 @@ fn a_browser_shows_training_and_controls_it() {
     assert!(place.path("run/model.safetensors").exists());
 }
 
-/// `PAGES=RUN,RUN cargo test --release --test cli ten_views -- --nocapture` measures runs of one's own, by their whole paths.
+/// `PAGES=RUN,RUN cargo test --release --test cli ten_views -- --nocapture` measures other runs, given by absolute
+/// paths.
 #[test]
-fn a_page_and_the_program_agree_in_ten_views() {
+fn scene_page_equals_render_in_ten_views() {
     let Ok(runs) = std::env::var("PAGES") else { return };
     let Some(mut browser) = Browser::open(Kind::Chromium) else { return };
     browser.size(200, 150, false);
@@ -527,7 +528,7 @@ fn a_page_and_the_program_agree_in_ten_views() {
     }
 }
 
-/// A page without a program behind it is moved as one that has one.
+/// Tests the camera controls of a scene page, which has no program.
 fn moves_about_a_page(browser: &mut Browser) {
     let whole = "!working && whole === wanted";
     let seen = |browser: &mut Browser| {
@@ -552,7 +553,7 @@ fn moves_about_a_page(browser: &mut Browser) {
     browser.key("x");
     browser.key("r");
     assert_eq!(seen(browser), first);
-    // As large as its window, and as fine as that shows.
+    // The image has the size and the resolution of the window.
     browser.size(32, 24, false);
     browser.until("picture.width === 32 && picture.height === 24 && target.width === 32");
     browser.until(whole);
@@ -561,7 +562,7 @@ fn moves_about_a_page(browser: &mut Browser) {
     assert_eq!(seen(browser), first);
 }
 
-/// What a page says of its parts that are not as they should be.
+/// Runs the checks of a page's scripts; they return the failures.
 #[track_caller]
 fn parts_are_right(browser: &mut Browser, checks: &str) {
     let wrong =
@@ -571,7 +572,7 @@ fn parts_are_right(browser: &mut Browser, checks: &str) {
 }
 
 #[test]
-fn the_parts_of_pages_are_right() {
+fn page_scripts_pass_their_checks() {
     let place = Place::with_scene();
     place.succeeds(&format!(
         "train scene --steps 20 --out run {SMALL} --set field.density_width=16 --set field.color_width=16"
@@ -590,7 +591,7 @@ fn the_parts_of_pages_are_right() {
     }
 }
 
-/// How much of its detail a model has, as its file says.
+/// The share of detail in a model file.
 fn detail(file: &[u8]) -> f64 {
     let (length, rest) = file.split_first_chunk().unwrap();
     let (head, data) = rest.split_at(u64::from_le_bytes(*length) as usize);
@@ -599,12 +600,12 @@ fn detail(file: &[u8]) -> f64 {
     f64::from_le_bytes(*data[at..].first_chunk().unwrap())
 }
 
-/// Of scenes that end, that go on, that all photographs look ahead at, and whose training was ended before all detail had come.
+/// Scenes that are bounded, unbounded and forward-facing, and one whose training ended before all detail was enabled.
 #[test]
-fn browser_renders_scene_page_as_the_program() {
+fn scene_page_in_browser_equals_render() {
     let place = Place::with_scene();
     place.add_landscape();
-    // All look the same way: what they show is wrong, and the same for both.
+    // All cameras look the same way. Their images are wrong, but both renderers must agree.
     let mut transforms = place.json("around/transforms.json");
     let first = transforms["frames"][0]["transform_matrix"].clone();
     for frame in transforms["frames"].as_array_mut().unwrap() {
@@ -613,9 +614,9 @@ fn browser_renders_scene_page_as_the_program() {
         }
     }
     for (name, train) in [
-        // Two march in even steps, as all scenes that end do.
+        // Two runs march with uniform steps, like all bounded scenes.
         ("object", "scene --steps 80 --set sampler.cone=0"),
-        // Of so few rounds a ray that all browsers here go through them, and with levels that are not hashed.
+        // Few enough rounds per ray for all browsers, and levels that are not hashed.
         (
             "slight",
             "scene --steps 100 --set field.grid.levels=4 --set field.grid.log2_table=13 --set field.density_width=16 --set field.color_width=16 --set sampler.cone=0",
@@ -626,7 +627,7 @@ fn browser_renders_scene_page_as_the_program() {
         if name == "ahead" {
             std::fs::write(place.path("around/transforms.json"), transforms.to_string()).unwrap();
         }
-        // What is said last counts.
+        // The last value of a setting counts.
         place.succeeds(&format!("train {SMALL} --out {name} {train}"));
     }
     let train = format!("train scene --steps 4000 --refine poses --out early {SMALL}");
@@ -647,10 +648,10 @@ fn browser_renders_scene_page_as_the_program() {
     }
     for mut browser in Browser::all() {
         let scenes = [("object", 0), ("slight", 0), ("landscape", 1), ("ahead", 2), ("early", 0)];
-        // Of what a stand-in leaves something out, one shows as much as all.
+        // If a software renderer leaves parts out, one scene is enough.
         let kept = |(name, _): &(&str, _)| browser.kind == Kind::Chromium || ["slight", "landscape"].contains(name);
         for (name, kind) in scenes.into_iter().filter(kept).collect::<Vec<_>>() {
-            // What stands in for a graphics card is slow: the page's own picture is small.
+            // Software rendering is slow, so the page's own image is small.
             browser.size(8, 6, false);
             let url = format!("file://{}", place.path(&format!("{name}.html")).display());
             browser.go(&url);
@@ -660,13 +661,13 @@ fn browser_renders_scene_page_as_the_program() {
             browser.until("typeof whole !== 'undefined' && whole === wanted && whole >= 0");
             assert_eq!(browser.value("data.space.kind"), kind);
             if name == "early" {
-                // One of the levels counts in part.
+                // One of the levels has a weight between 0 and 1.
                 let levels = browser.number("data.grid.levels.length");
                 let counts = 3.0 + detail(&place.bytes("early/model.safetensors")) * (levels - 3.0);
                 assert!(counts > 3.0 && counts < levels && counts.fract() > 0.0, "{counts}");
             }
             browser.shot(&format!("page-{name}"));
-            // From where it is looked at first, and from behind; photographs of a landscape are from a part of the circle.
+            // The initial view and the opposite one. The landscape's images cover only a part of the circle.
             let poses = [(0, "data.view.pose"), (1, "(reset(), orbit(-Math.PI, 0), rows(view))")];
             for (frame, pose) in poses.into_iter().take(if name == "object" { 2 } else { 1 }) {
                 let asked = format!("render({pose}, data.view.fov, 40, 30).then((bytes) => Array.from(bytes))");
@@ -675,7 +676,7 @@ fn browser_renders_scene_page_as_the_program() {
                 let darkest = expected.data.iter().copied().fold(1.0, f32::min);
                 assert!(darkest < 0.8, "{name} shows something: {darkest}");
                 let alike = psnr(&image, &expected);
-                // A stand-in that ends loops early leaves something out, which is said.
+                // A software renderer that ends loops early leaves parts out, and the page says so.
                 let partial = browser.value("status.textContent.includes('leaves parts')") == true;
                 println!("{:?} {name} {frame}: {alike:.1} dB, {partial}", browser.kind);
                 assert!(

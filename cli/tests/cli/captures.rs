@@ -1,4 +1,4 @@
-//! `raygrad train` and `eval` of what captures bring with them: depths, cameras that are off, exposures that differ.
+//! `raygrad train` and `eval` on captures with depth, inaccurate cameras and varying exposure.
 
 use super::{Place, SIZE, SMALL, png};
 use raygrad::Real;
@@ -6,7 +6,7 @@ use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::{Camera, Config, Image, Model, SceneBox};
 use serde_json::{Value, json};
 
-/// The model of a run.
+/// Loads the model of a run.
 fn model(place: &Place, run: &str) -> Model<f32> {
     let config = place.json(&format!("{run}/config.json"));
     let extent: SceneBox = serde_json::from_value(config["scene_box"].clone()).unwrap();
@@ -19,7 +19,7 @@ fn terms(place: &Place, run: &str) -> Value {
 }
 
 #[test]
-fn depths_are_learned_from_where_that_is_asked_for() {
+fn depth_loss_uses_depth_files() {
     let place = Place::with_scene();
     place.succeeds("prepare scene --to nerfstudio --out captured");
     let mut transforms = place.json("captured/transforms.json");
@@ -35,7 +35,7 @@ fn depths_are_learned_from_where_that_is_asked_for() {
         let text = String::from_utf8(place.bytes(&format!("{run}/metrics.jsonl"))).unwrap();
         serde_json::from_str::<Value>(text.lines().next().unwrap()).unwrap()["loss"].as_f64().unwrap()
     };
-    // Without files of depths there is nothing to learn from.
+    // Without depth files there is nothing to learn from.
     place.fails(&format!("train captured --steps 1 --depth-loss {SMALL}"), &["`loss_terms`", "depth_file_path"]);
     std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
     let [plain, usual, heavy] = [loss("", "plain"), loss("--depth-loss", "usual"), loss("--depth-loss=2", "heavy")];
@@ -43,7 +43,7 @@ fn depths_are_learned_from_where_that_is_asked_for() {
     assert_eq!(terms(&place, "heavy"), json!([{ "kind": "depth", "weight": 2.0 }]));
     assert!(usual > plain, "{usual} {plain}");
     assert!(((heavy - plain) / (usual - plain) - 20.0).abs() < 1e-3, "{plain} {usual} {heavy}");
-    // They go along where a format has them, and are said to be left where it has none.
+    // Conversions keep depth if the format supports it, and warn otherwise.
     place.succeeds("prepare captured --to nerfstudio --out again");
     assert_eq!(place.json("again/transforms.json")["depth_unit_scale_factor"], json!(0.1));
     let again = place.json("again/transforms.json")["frames"][0]["depth_file_path"].as_str().unwrap().to_owned();
@@ -53,19 +53,19 @@ fn depths_are_learned_from_where_that_is_asked_for() {
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(output.status.success() && said.contains("depth files are not converted: "), "{flags}: {said}");
     }
-    // The landscape measures its own.
+    // The landscape provides exact distances.
     place.succeeds(&format!("train landscape --downscale 20 --steps 1 --depth-loss --out far {SMALL}"));
     assert_eq!(terms(&place, "far")[1], json!({ "kind": "depth", "weight": 0.1 }));
     place.fails(&format!("train embedded --downscale 20 --steps 1 --depth-loss {SMALL}"), &["`loss_terms`"]);
 }
 
 #[test]
-fn terms_and_the_nearest_distance_can_be_said() {
+fn loss_terms_and_near_plane_are_configurable() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out one {SMALL} --loss entropy=0.001 --near 2.5"));
     assert_eq!(terms(&place, "one"), json!([{ "kind": "entropy", "weight": 0.001 }]));
     assert_eq!(place.json("one/config.json")["scene_box"]["near_far"], json!([2.5, 6.0]));
-    // Those that a scope brings are replaced or taken away.
+    // Loss terms of the scene type are replaced or removed.
     for (flag, expected) in [
         ("distortion=0", json!([])),
         ("distortion=0.5", json!([{ "kind": "distortion", "weight": 0.5 }])),
@@ -74,7 +74,7 @@ fn terms_and_the_nearest_distance_can_be_said() {
         place.succeeds(&format!("train scene --scene-type unbounded --steps 1 --out {flag} {SMALL} --loss {flag}"));
         assert_eq!(terms(&place, flag), expected);
     }
-    // In the units of the files: here a unit of theirs is not one of the scene.
+    // In units of the files, which differ from scene units here.
     place.succeeds(&format!("train scene --scene-type unbounded --steps 1 --out near --near 0.25 {SMALL}"));
     let config = place.json("near/config.json");
     let scale = config["scene_box"]["transform"]["scale"].as_f64().unwrap();
@@ -97,14 +97,14 @@ fn terms_and_the_nearest_distance_can_be_said() {
     }
 }
 
-/// The rendered part of the first picture of an evaluation.
+/// The render in the first image of an evaluation.
 fn rendered(place: &Place, name: &str) -> Image {
     let picture = png(&place.path(&format!("{name}/000.png")));
     let data = (0..SIZE * SIZE).flat_map(|i| picture.pixel(SIZE + i % SIZE, i / SIZE).to_vec()).collect();
     Image { width: SIZE, height: SIZE, channels: 3, data }
 }
 
-/// How far two images are apart, at most.
+/// The largest difference of two images.
 fn apart(a: &Image, b: &Image) -> f32 {
     assert_eq!([a.width, a.height], [b.width, b.height]);
     a.data.iter().zip(&b.data).map(|(a, b)| (a - b.clamp(0.0, 1.0)).abs()).fold(0.0, Real::maximum)
@@ -113,12 +113,12 @@ fn apart(a: &Image, b: &Image) -> f32 {
 #[test]
 fn eval_uses_the_models_cameras() {
     let place = Place::with_scene();
-    // At a rate at which they go astray, so that it can be seen.
+    // A large learning rate, so that the refinement is visible.
     let fast = r#"--set poses={"constant":{"rate":0.1}} --set camera_optimizer={"focal":{"constant":{"rate":0.02}}}"#;
     place.succeeds(&format!("train scene --steps 40 --out run {SMALL} {fast}"));
     let model = model(&place, "run");
     let view = |camera: &Camera| model.render(camera, [1.0; 3]).color;
-    // An animation from photograph to photograph, too.
+    // Animations through images use them too.
     place.succeeds("render run --path test --out way");
     let first = png(&place.path("way/0000.png"));
     let given = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
@@ -127,11 +127,11 @@ fn eval_uses_the_models_cameras() {
     place.succeeds("render run --path spline --keyframes 2 --frames 1 --out through");
     let through = png(&place.path("through/0000.png"));
     assert!(apart(&through, &view(&model.other_camera(trained))) > 0.02);
-    // A path's cameras have square pixels, and the vertical angle of the photograph's.
+    // A path's cameras have square pixels and the vertical field of view of the image.
     let learned = model.learned_camera(2, trained);
     let learned = Camera { focal: [learned.focal[1]; 2], ..learned };
     assert!(apart(&through, &view(&learned)) < 0.01);
-    // Or from where each is shown best.
+    // Or with poses fitted to the images.
     place.succeeds("eval run --fit-poses --views 2");
     let fitted = place.json("run/eval-test-fast-2-poses.json");
     assert_eq!(fitted["cameras"], "each fitted to its own photograph");
@@ -167,7 +167,7 @@ fn eval_states_exposure_of_held_out_images() {
             .succeeds("eval codes --views 1")
             .contains("exposure and appearance embeddings: mean of the training images")
     );
-    // The mean exposure, and corners that are as dark as in all photographs.
+    // The mean exposure, and the vignetting of all images.
     let mut model = model(&place, "run");
     let camera = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
     let shown = rendered(&place, "run/eval-test-fast");
@@ -175,7 +175,7 @@ fn eval_states_exposure_of_held_out_images() {
     model.vignetted = true;
     let own = apart(&shown, &model.render(camera, [1.0; 3]).color);
     assert!(own < 0.01 && bright > 0.02, "{own} {bright}");
-    // After a gain for the left half of the picture, the right half of it is compared.
+    // With a gain fitted to the left half, the right half is compared.
     place.succeeds("eval plain --fit-half");
     let half = place.json("plain/eval-test-fast-half.json");
     assert_eq!(half["appearance"], "gains fitted to the left half, right half compared");
@@ -189,7 +189,7 @@ fn eval_states_exposure_of_held_out_images() {
     let mse = errors.sum::<f64>() / (3 * SIZE * SIZE / 2) as f64;
     let psnr = half["per_view"][0]["psnr"].as_f64().unwrap();
     assert!((psnr + 10.0 * mse.log10()).abs() < 0.05, "{psnr} {mse}");
-    // What was trained on has its own exposure.
+    // Training images have their own exposure.
     place.succeeds("eval run --split train");
     assert_eq!(place.json("run/eval-train-fast.json")["appearance"], "each photograph's own");
     let camera = &load(place.path("scene"), Split::Train, 1).unwrap().frames[0].camera;
@@ -201,7 +201,7 @@ fn eval_states_exposure_of_held_out_images() {
 }
 
 #[test]
-fn moved_captures_are_seen_from_their_cameras() {
+fn moved_captures_render_from_their_cameras() {
     let place = Place::with_scene();
     place.succeeds(&format!(
         "train scene --scene-type unbounded --steps 12 --out run {SMALL} --refine exposure,vignetting"
@@ -221,7 +221,7 @@ fn moved_captures_are_seen_from_their_cameras() {
 }
 
 #[test]
-fn a_model_is_as_fine_as_its_photographs() {
+fn hash_grid_resolution_follows_the_images() {
     let place = Place::with_scene();
     let small = SMALL.replace("--set field.grid.log2_table=10", "");
     place.succeeds(&format!("train scene --steps 1 --out run {small}"));
@@ -240,7 +240,7 @@ fn opaque_images_have_plain_background() {
     assert_eq!(background("", "usual"), "white");
     assert_eq!(background("--background random", "random"), "random");
     assert_eq!(background("--background black", "black"), "black");
-    // What samples evenly would see nothing of a scene that goes on.
+    // Samplers with uniform samples would miss an unbounded scene.
     place.fails_with(
         "train landscape --downscale 20 --steps 1 --preset small",
         "`preset`: small spaces samples evenly, too few for the long rays of an unbounded scene: use instant or \
@@ -251,12 +251,12 @@ fn opaque_images_have_plain_background() {
 }
 
 #[test]
-fn what_was_trained_on_is_no_test() {
+fn eval_of_training_images_as_test_is_an_error() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));
     let mut test = place.transforms(Split::Test);
     let train = place.transforms(Split::Train);
-    // Later, the second test view is one of those that were trained on, under its name.
+    // Now the second test image is a former training image, with its name.
     let mut rest = train.clone();
     let moved = rest["frames"].as_array_mut().unwrap().remove(3);
     test["frames"][1] = moved;
@@ -267,16 +267,16 @@ fn what_was_trained_on_is_no_test() {
         "`scene`: the test image `train/r_3` was a training image of the run: name the unchanged capture with --scene",
     );
     place.fails("eval run --split val --scene absent", &["absent"]);
-    // A path from photograph to photograph is by those that were trained on.
+    // A path through images needs the training images.
     place.fails("render run --path spline --keyframes 0", &["trained on 6", "name their folder with --scene"]);
-    // A run of the first edition does not know the names of its photographs.
+    // Runs of version 0.1 do not store the names of images.
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));
     let mut config = place.json("run/config.json");
     config["photographs"] = json!([]);
     std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
     place.succeeds("render run --path spline --keyframes 0,3 --frames 2 --size 4x4");
-    // Nor has one that was not trained on a camera that was learned.
+    // A run without a refined camera for an image refuses it too.
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL} --refine poses"));
     let mut train = place.transforms(Split::Train);
@@ -299,7 +299,7 @@ fn forward_facing_capture_trains_in_ndc() {
     for (i, frame) in transforms["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
         let picture = place.path(&format!("captured/{}", frame["file_path"].as_str().unwrap()));
         png(&picture).over([0.2; 3]).save_png(picture).unwrap();
-        // Along -z, side by side.
+        // Side by side, looking along -z.
         let [x, y] = [0.3 * (i % 3) as f64, 0.2 * (i / 3) as f64];
         frame["transform_matrix"] =
             json!([[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, y], [0.0, 0.0, 1.0, 0.1 * x], [0.0, 0.0, 0.0, 1.0]]);
@@ -311,7 +311,7 @@ fn forward_facing_capture_trains_in_ndc() {
         "{said}"
     );
     let ndc = model(&place, "ahead").scene_box.ndc.unwrap();
-    // Up is up in the scene, and the picture is taken from behind the cameras. A nearer near plane is nearer in it.
+    // Up is preserved, and the frustum's eye is behind the cameras. A nearer near plane is nearer in the frustum.
     let survey = raygrad::nerf::dataset::Capture::read(place.path("captured")).unwrap().analyze_scene(None).unwrap();
     assert_eq!(survey.ndc, Some(ndc));
     assert!(ndc.axes.y_axis.z > 0.999 && ndc.eye.z.abs() < 1.0, "{ndc:?}");
@@ -325,7 +325,7 @@ fn forward_facing_capture_trains_in_ndc() {
     place.succeeds("render ahead --frames 2");
     place.succeeds("eval ahead");
     place.succeeds(&format!("train captured --scene-type unbounded --steps 1 --out around {SMALL}"));
-    // What is gone on with says how far it goes.
+    // A resumed run has its scene type.
     for (run, scope) in [("ahead", "forward-facing"), ("around", "unbounded")] {
         let said = place.succeeds(&format!("train --resume {run} --steps 2"));
         assert!(said.contains(&format!("{scope}: as in training")), "{said}");

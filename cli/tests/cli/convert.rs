@@ -1,4 +1,4 @@
-//! `raygrad prepare` from one format to another: the same rays, whatever the way.
+//! `raygrad prepare` between formats keeps all rays.
 
 use super::{CLASSIC, Place};
 use raygrad::nerf::dataset::{Capture, Format, Photo, Split, View};
@@ -8,10 +8,10 @@ use serde_json::{Value, json};
 use std::collections::HashSet;
 use std::path::PathBuf;
 
-/// Pixels that a ray may be off after any number of conversions.
+/// The largest error of a ray after all conversions, in pixels.
 const OFF: f64 = 1e-5;
 
-/// The capture of a fox that instant-ngp comes with, if it is at hand.
+/// The folder of instant-ngp's fox capture, if available.
 fn fox() -> Option<PathBuf> {
     let here = || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data"));
     let fox = std::env::var_os("RAYGRAD_DATA").map_or_else(here, PathBuf::from).join("fox");
@@ -22,7 +22,7 @@ fn fox() -> Option<PathBuf> {
     is_there.then_some(fox)
 }
 
-/// A dataset in `scene` with a lens, a mask, images in two folders and one that is absent.
+/// Writes a dataset with a lens, a mask, images in two folders and an absent image to `scene`.
 fn with_lens(place: &Place) {
     let mut frames = vec![];
     std::fs::create_dir_all(place.path("scene/images/more")).unwrap();
@@ -63,7 +63,7 @@ fn read(place: &Place, folder: &str) -> Capture {
     Capture::read(place.path(folder)).unwrap()
 }
 
-/// The views of a capture by the stems of their names, in order.
+/// The views of a capture with the stems of their names, sorted.
 fn by_name(capture: &Capture) -> Vec<(String, &View)> {
     let stem = |view: &View| {
         let inner = view.name.trim_start_matches("images/").replace('/', "_");
@@ -74,7 +74,7 @@ fn by_name(capture: &Capture) -> Vec<(String, &View)> {
     views
 }
 
-/// Whether both captures have the same photographs and pixels of them the same rays.
+/// Checks that two captures have the same images, and the same rays through their pixels.
 #[track_caller]
 fn same_rays(a: &Capture, b: &Capture, most: f64) {
     let (a, b) = (by_name(a), by_name(b));
@@ -92,13 +92,13 @@ fn same_rays(a: &Capture, b: &Capture, most: f64) {
     }
 }
 
-/// Places all over an image, its corners among them.
+/// Positions all over an image, including its corners.
 fn grid(camera: &Camera) -> impl Iterator<Item = (f64, f64)> {
     let [w, h] = [camera.width as f64, camera.height as f64];
     (0..=6).flat_map(move |j| (0..=6).map(move |i| (w * f64::from(i) / 6.0, h * f64::from(j) / 6.0)))
 }
 
-/// Over all formats that have lenses, and back.
+/// Converts through all formats that support lenses, and back.
 fn there_and_back(place: &Place, scene: &str, most: f64) {
     place.succeeds(&format!("prepare {scene} --to colmap-text --out text"));
     place.succeeds("prepare text --to colmap --out binary");
@@ -127,7 +127,7 @@ fn lenses_and_poses_survive_every_format() {
     let original = read(&place, "scene");
     let splits = |capture: &Capture| by_name(capture).iter().map(|(_, view)| view.split).collect::<Vec<_>>();
     assert_eq!(splits(&original), splits(&back), "the same photographs are held out");
-    // A dataset that is another's is trained on as it is.
+    // A foreign dataset is trained on without conversion.
     place.succeeds(&format!("train back --scene-type bounded --steps 1 {CLASSIC}"));
 }
 
@@ -144,7 +144,7 @@ fn unsupported_formats_are_refused_before_writing() {
             && said.contains("1 masks are not converted: LLFF has none"),
         "{said}"
     );
-    // Two images that would have one name, as folders go.
+    // Two images whose names would collide in one folder.
     std::fs::copy(place.path("scene/images/7.png"), place.path("scene/images/more_9.png")).unwrap();
     let mut transforms = place.json("scene/transforms.json");
     transforms["frames"][0]["file_path"] = "images/more_9.png".into();
@@ -163,7 +163,7 @@ fn undistorted_images_fit_every_format() {
     with_lens(&place);
     place.succeeds("prepare scene --undistort --out flat");
     let flat = read(&place, "flat");
-    // The absent one is left out.
+    // The absent image is left out.
     assert_eq!((flat.format, flat.views.len(), flat.present().count()), (Format::Transforms, 9, 9));
     let original = read(&place, "scene");
     for (name, view) in by_name(&flat) {
@@ -174,7 +174,7 @@ fn undistorted_images_fit_every_format() {
         assert_same_directions(camera, &before.camera);
         assert_eq!(view.mask.is_some(), before.mask.is_some());
     }
-    // Pinhole cameras go everywhere from here, and nothing is resampled twice.
+    // Pinhole cameras fit all formats, and nothing is resampled twice.
     std::fs::remove_dir_all(place.path("flat/masks")).unwrap();
     let mut transforms = place.json("flat/transforms.json");
     for frame in transforms["frames"].as_array_mut().unwrap() {
@@ -215,7 +215,7 @@ fn differing_cameras_become_one_where_needed() {
         let sizes = made.views.iter().map(|view| [view.camera.width, view.camera.height]);
         assert_eq!(sizes.collect::<HashSet<_>>().len() == 1, one, "{to}");
         if to == "blender" {
-            // Its names have the split in them.
+            // The names of this format contain the split.
             continue;
         }
         for (name, view) in by_name(&made) {
@@ -231,7 +231,7 @@ fn differing_cameras_become_one_where_needed() {
 fn cameras_are_written_for_the_size_that_images_have() {
     let place = Place::empty();
     with_lens(&place);
-    // Somebody has made the images smaller, and not told the file.
+    // The images were downsized without a change of the file.
     for view in read(&place, "scene").present() {
         let path = view.image.as_ref().unwrap();
         Photo::open(path, None).unwrap().resized([24, 16]).save(path).unwrap();
@@ -246,7 +246,7 @@ fn cameras_are_written_for_the_size_that_images_have() {
     }
 }
 
-/// Whether an undistorted camera has at each of its pixels what the original had where it saw that.
+/// Checks that each pixel of an undistorted camera shows the same direction of the original.
 #[track_caller]
 fn assert_same_directions(flat: &Camera, original: &Camera) {
     assert_eq!(flat.pose, original.pose);
@@ -262,7 +262,7 @@ fn assert_same_directions(flat: &Camera, original: &Camera) {
 }
 
 #[test]
-fn points_tell_depths_and_go_along() {
+fn points_give_bounds_and_are_converted() {
     let place = Place::empty();
     with_lens(&place);
     let points: String =
@@ -278,12 +278,12 @@ fn points_tell_depths_and_go_along() {
     place.succeeds("prepare sparse --to llff --undistort --out llff");
     for view in &read(&place, "llff").views {
         let [near, far] = view.bounds.unwrap();
-        // Cameras are some 3 to 4 away from points that lie within 0.6 of the origin.
+        // Cameras are about 3 to 4 away from points, which lie within 0.6 of the origin.
         assert!(near > 2.0 && far < 4.5 && far - near > 0.1, "{near} {far}");
     }
 }
 
-/// Makes the upper left of a matrix the nearest rotation, by Newton's method.
+/// Replaces the rotation of a matrix by the nearest exact one, with Newton's method.
 fn make_rigid(matrix: &mut Value) {
     let at = |r: usize, c: usize| matrix[r][c].as_f64().unwrap();
     let column = |c: usize| DVec3::new(at(0, c), at(1, c), at(2, c));
@@ -297,11 +297,11 @@ fn make_rigid(matrix: &mut Value) {
 }
 
 #[test]
-fn the_fox_is_the_same_in_every_format() {
+fn fox_round_trips_through_all_formats() {
     let Some(fox) = fox() else { return };
     let place = Place::empty();
     let mut transforms: Value = serde_json::from_slice(&std::fs::read(fox.join("transforms.json")).unwrap()).unwrap();
-    // A few are enough; some of those listed are absent.
+    // A few images are enough; some of the listed ones are absent.
     transforms["frames"].as_array_mut().unwrap().truncate(6);
     std::fs::create_dir_all(place.path("fox/images")).unwrap();
     for frame in transforms["frames"].as_array().unwrap() {
@@ -311,7 +311,7 @@ fn the_fox_is_the_same_in_every_format() {
         }
     }
     std::fs::write(place.path("fox/transforms.json"), transforms.to_string()).unwrap();
-    // Its matrices are rotations to a millionth only, which quaternions are not asked to keep.
+    // The matrices are rotations to about 1e-6 only, which quaternions cannot keep.
     there_and_back(&place, "fox", 2e-3);
     for folder in ["text", "binary", "back"] {
         std::fs::remove_dir_all(place.path(folder)).unwrap();
@@ -333,7 +333,7 @@ fn the_fox_is_the_same_in_every_format() {
 }
 
 #[test]
-fn built_in_scenes_are_written_for_other_programs() {
+fn built_in_scenes_convert_to_other_formats() {
     let place = Place::empty();
     for (scene, format, size, count) in
         [("embedded", "nerfstudio", [24, 24], 90), ("landscape", "colmap", [16, 12], 130)]

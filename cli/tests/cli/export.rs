@@ -6,7 +6,7 @@ use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Config, Model, SceneBox};
 use std::path::Path;
 
-/// The cameras in a file of this name, read as a dataset's in the folder `scene`.
+/// The cameras of an exported file, read as those of a dataset in `scene`.
 fn exported(place: &Place, file: &str) -> Vec<(String, Option<Split>, Camera)> {
     let folder = tempfile::tempdir_in(place.path("")).unwrap();
     std::fs::copy(place.path(file), folder.path().join("transforms.json")).unwrap();
@@ -51,12 +51,12 @@ fn exported_cameras_return_as_given() {
             assert!(close(&back, &after.2, 1e-12) && !close(&back, &before.2, 1e-5), "{}", before.0);
         }
         let trained = before.1 == Some(Split::Train);
-        // Those that were not trained on are where they were, as what all have done is undone.
+        // Cameras that were not trained on stay, since the common drift is removed.
         assert_eq!(close(&before.2, &after.2, 1e-9), !trained, "{}", before.0);
-        // A step moves by a little, in the coordinates of the files and not in those of the scene.
+        // The change is small in units of the files.
         assert!(close(&before.2, &after.2, 0.5), "{}: {:?} {:?}", before.0, before.2.pose, after.2.pose);
     }
-    // As a dataset: the same cameras, and images beside them.
+    // As a dataset: the same cameras, with images.
     place.succeeds("export run colmap --to colmap");
     let (file, colmap) = (exported(&place, "run/cameras.json"), cameras(&place.path("colmap")));
     for (name, _, camera) in &colmap {
@@ -64,7 +64,7 @@ fn exported_cameras_return_as_given() {
         assert!(close(camera, before, 1e-9), "{name}");
     }
     assert!(colmap.len() == 11 && place.path("colmap/images/train/r_0.png").exists());
-    // Of a capture whose names are not the paths of its images, too.
+    // Also for captures whose names differ from the paths of their images.
     place.succeeds(&format!("train colmap --steps 1 --out other {SMALL}"));
     place.succeeds("export other colmap/again.json");
     for frame in place.json("colmap/again.json")["frames"].as_array().unwrap() {
@@ -77,14 +77,14 @@ fn exported_cameras_return_as_given() {
          page, or name a format with --to",
     );
     place.fails_with("export run colmap --to llff", "colmap: is not empty: choose another --out");
-    // Other photographs than those that it was trained on have no refined cameras.
+    // Refined cameras need the training images of the run.
     std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();
     place.fails("export run other.json", &["has 5 training images", "trained on 6"]);
     assert!(!place.path("other.json").exists());
 }
 
 #[test]
-fn the_built_in_scene_has_cameras_too() {
+fn built_in_scene_exports_its_cameras() {
     let place = Place::empty();
     place.succeeds(&format!("train --steps 1 --downscale 10 {CLASSIC}"));
     assert!(place.succeeds("export run cameras.json").starts_with("exported 90 cameras, 0 of them refined"));
@@ -93,25 +93,25 @@ fn the_built_in_scene_has_cameras_too() {
     assert_eq!((of(Split::Train), of(Split::Val), of(Split::Test)), (60, 10, 20));
 }
 
-/// The places of the vertices of a PLY file, and its text up to those.
+/// The vertices of a PLY file, and its header.
 fn vertices(place: &Place, file: &str) -> (Vec<DVec3>, String) {
     let bytes = place.bytes(file);
     let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
     let header = String::from_utf8(bytes[..end].to_vec()).unwrap();
     let count = header.lines().find_map(|line| line.strip_prefix("element vertex ")).unwrap().parse().unwrap();
-    // Three doubles, three floats and three bytes each.
+    // Three doubles, three floats and three bytes per vertex.
     let number = |row: &[u8], axis: usize| f64::from_le_bytes(row[8 * axis..][..8].try_into().unwrap());
     let rows = bytes[end..].chunks_exact(39).take(count);
     (rows.map(|row| DVec3::new(number(row, 0), number(row, 1), number(row, 2))).collect(), header)
 }
 
 #[test]
-fn shapes_are_in_the_coordinates_of_the_capture() {
+fn meshes_are_in_capture_coordinates() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 2 --out run --scene-type unbounded {SMALL}"));
     let extent: SceneBox = serde_json::from_value(place.json("run/config.json")["scene_box"].clone()).unwrap();
     assert!((extent.transform.scale - 1.0).abs() > 0.01, "the test is of coordinates that differ");
-    // A fog, still: at a low density its surface is the box.
+    // The model is still a fog: at a low iso-value its surface is the box.
     let said = place.succeeds("export run mesh.ply --iso-value 1e-6 --resolution 20");
     assert!(
         said.starts_with("exported ") && said.contains(", closed; iso-value 0.0000 per scene unit, 20 cells"),
@@ -134,7 +134,7 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
 
     let few = place.succeeds("export run few.glb --iso-value 1e-6 --resolution 20 --triangles 500");
     assert!(few.contains(" 500 triangles, closed"), "{few}");
-    // Four are too few for a closed surface with holes or corners in it, which is said.
+    // Four triangles are too few for a closed surface with such a topology; the program says so.
     let output = place.command("export run few.ply --iso-value 1e-6 --resolution 20 --triangles 4").output().unwrap();
     let [said, noted] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
     assert_eq!(!said.contains(" 4 triangles"), noted.contains("triangles, more than 4:"), "{said} {noted}");
@@ -156,7 +156,7 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
         "export run cameras.json --points",
         "`points`: applies to meshes and point clouds: name a .ply, .obj or .glb file",
     );
-    // Those of six photographs, and four rings of twelve around the scene, which are left when it is gone.
+    // Six images and four rings of twelve views; the rings are enough if the capture is gone.
     assert!(said.contains("in 54 views"), "{said}");
     std::fs::rename(place.path("scene"), place.path("moved")).unwrap();
     assert!(place.succeeds("export run some.ply --points=20").contains("in 48 views"));

@@ -1,14 +1,14 @@
-//! Runs that are killed, or refused something, at each call to the system that leaves something on disk.
+//! Kills and errors at each system call that changes the disk.
 //!
-//! `FAULTS=all cargo test --test cli faults -- --nocapture` is the campaign: every call. The suite has one of 31. Both
-//! need `strace`, and say that they skip without it.
+//! `FAULTS=all cargo test --test cli faults -- --nocapture` tests every call; the suite tests one in 31. Both need
+//! `strace` and print a skip message without it.
 
 use super::Place;
 use super::SMALL;
 use super::resume::assert_same;
 use std::process::{Command, Output};
 
-/// Calls that leave something on disk, and what each is for.
+/// System calls that change the disk, and their purpose.
 const CALLS: [(&str, &str); 6] = [
     ("mkdir", "a folder is made"),
     ("openat", "a file is opened"),
@@ -17,10 +17,10 @@ const CALLS: [(&str, &str); 6] = [
     ("renameat", "a file gets its name"),
     ("unlink", "an old file goes"),
 ];
-/// What a disk may answer in place of doing it.
+/// Possible errors of a disk.
 const ANSWERS: [&str; 4] = ["ENOSPC", "EIO", "EROFS", "EDQUOT"];
 
-/// Every how many calls there is a fault.
+/// The number of calls per tested fault.
 fn stride() -> usize {
     if std::env::var("FAULTS").is_ok_and(|which| which == "all") { 1 } else { 31 }
 }
@@ -33,7 +33,7 @@ fn has_strace() -> bool {
     found
 }
 
-/// Runs the program, with a fault if one is given (`CALL:FAULT:when=N`), and gives what came of it and its calls.
+/// Runs the program, with a fault if one is given (`CALL:FAULT:when=N`). Returns its output and its calls.
 fn traced(place: &Place, fault: Option<&str>, arguments: &str) -> (Output, Vec<String>) {
     let log = place.path("strace.log");
     let mut command = Command::new("strace");
@@ -45,26 +45,26 @@ fn traced(place: &Place, fault: Option<&str>, arguments: &str) -> (Output, Vec<S
     command.arg(env!("CARGO_BIN_EXE_raygrad")).args(arguments.split_whitespace());
     let output = command.output().unwrap();
     let text = std::fs::read_to_string(&log).unwrap();
-    // Those of the thread that writes files: faults are counted for each thread.
+    // Calls of the thread that writes files, since strace counts faults per thread.
     let first = text.split_whitespace().next().unwrap_or_default().to_owned();
     let own = text.lines().filter_map(|line| line.strip_prefix(&first)).map(|line| line.trim().to_owned());
     (output, own.collect())
 }
 
-/// Whether a call only asks: whose the run is, as each write does, or how long earlier parts of it took. That this cannot be read
-/// for once changes nothing.
+/// Returns true if a call only reads the run's owner, as before each write, or the times of earlier parts. A single
+/// failure of it changes nothing.
 fn asks(call: &str) -> bool {
     ["run/lock.owner\"", "run/summary.json\""].iter().any(|name| call.contains(name)) && call.contains("O_RDONLY")
 }
 
-/// The numbers of the calls of this kind that are about the run, from 1 as faults count them.
+/// The numbers, from 1 as in strace, of the calls of this kind that concern the run.
 fn about_the_run(calls: &[String], kind: &str) -> Vec<usize> {
     let of_kind = calls.iter().filter(|line| line.starts_with(&format!("{kind}(")));
     let ours = |line: &&String| (line.contains("\"run") || line.contains("/run/")) && !asks(line);
     of_kind.enumerate().filter(|(_, line)| ours(line)).map(|(i, _)| i + 1).collect()
 }
 
-/// Whether the calls have these names on this system; says so if not.
+/// Returns true if the calls have these names on this system; prints a skip message otherwise.
 fn has_names(calls: &[String]) -> bool {
     let found = CALLS.iter().all(|(call, _)| !about_the_run(calls, call).is_empty());
     assert!(found || !cfg!(all(target_arch = "x86_64", target_env = "gnu")), "{calls:?}");
@@ -78,7 +78,7 @@ fn begin() -> String {
     format!("--threads 1 train scene --steps 12 --checkpoint-every 0.001s --out run {SMALL}")
 }
 
-/// Goes on with what a fault has left, with a new run if that was not even begun, and gives what it was.
+/// Resumes the run, or trains a new one if it had not begun; returns which.
 fn go_on(place: &Place) -> &'static str {
     if !place.path("run/config.json").exists() {
         place.succeeds(&begin());
@@ -88,7 +88,7 @@ fn go_on(place: &Place) -> &'static str {
     "the run: went on"
 }
 
-/// A place with an undisturbed run in `whole`, and its calls; nothing, which it says, where faults cannot be made.
+/// A place with an undisturbed run in `whole`, and its calls; `None` with a message if faults cannot be injected.
 fn undisturbed() -> Option<(Place, Vec<String>)> {
     if !has_strace() {
         return None;
@@ -105,16 +105,16 @@ fn forget(place: &Place) {
 }
 
 #[test]
-fn faults_that_kill_a_run_at_any_call_cost_it_nothing() {
+fn faults_by_kill_at_any_call_lose_nothing() {
     let Some((place, calls)) = undisturbed() else { return };
     let mut kills = 0;
     for (call, what) in CALLS {
         let (mut anew, mut on) = (0, 0);
         for number in about_the_run(&calls, call).into_iter().step_by(stride()) {
             forget(&place);
-            // As the call is about to be made.
+            // At the start of the call.
             let (output, _) = traced(&place, Some(&format!("{call}:signal=KILL:when={number}")), &begin());
-            // How many calls there are depends on time: a run may be too quick to be killed.
+            // The number of calls depends on time, so a run may end before the kill.
             if !output.status.success() {
                 kills += 1;
                 if go_on(&place).starts_with("nothing") { anew += 1 } else { on += 1 }
@@ -127,7 +127,7 @@ fn faults_that_kill_a_run_at_any_call_cost_it_nothing() {
 }
 
 #[test]
-fn faults_of_a_disk_lose_no_run() {
+fn faults_of_the_disk_lose_no_run() {
     let Some((place, calls)) = undisturbed() else { return };
     for (i, (call, what)) in CALLS.into_iter().enumerate() {
         let (mut ended, mut warned, mut silent, mut words) = (0, 0, 0, String::new());
@@ -142,9 +142,9 @@ fn faults_of_a_disk_lose_no_run() {
             let line = said.lines().find(|line| line.starts_with("raygrad: ") && !line.contains("few-photographs"));
             match (output.status.code(), line) {
                 (Some(0), Some(_)) => warned += 1,
-                // There may be fewer calls this time.
+                // This run may have fewer calls.
                 (Some(0), None) if !calls.iter().any(|call| call.contains("(INJECTED)") && !asks(call)) => silent += 1,
-                // What cannot write cannot say so.
+                // A program that cannot write cannot print an error.
                 (Some(1), line) if line.is_some() || call == "write" => ended += 1,
                 _ => {
                     let injected: Vec<_> = calls.iter().filter(|call| call.contains("(INJECTED)")).collect();

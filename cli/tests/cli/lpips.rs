@@ -1,4 +1,4 @@
-//! `raygrad eval --lpips` and what it leaves.
+//! `raygrad eval --lpips` and its results.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use raygrad::nerf::imaging::lpips::Lpips;
 use raygrad::nn::{Params, Storage};
 use serde_json::{Value, json};
 
-/// The convolutions of a network: slice, layer, outputs, extent of the kernel.
+/// The convolutions of a network: slice, layer, outputs, kernel size.
 type Layers = &'static [(usize, usize, usize, usize)];
 
 const ALEX: Layers = &[(1, 0, 64, 11), (2, 3, 192, 5), (3, 6, 384, 3), (4, 8, 256, 3), (5, 10, 256, 3)];
@@ -29,7 +29,7 @@ const VGG: Layers = &[
     (5, 28, 512, 3),
 ];
 
-/// A file of weights without a pattern.
+/// Writes a weights file with pseudo-random values.
 fn weights(place: &Place, name: &str, layers: Layers) {
     let noise = |i: usize| ((i as u32).wrapping_mul(2_654_435_761) >> 8) as f32 / (1 << 23) as f32 - 1.0;
     let (mut params, mut inputs) = (Params::<f32>::new(), 3);
@@ -49,7 +49,7 @@ fn weights(place: &Place, name: &str, layers: Layers) {
     std::fs::write(place.path(name), params.to_safetensors(Storage::Full, &BTreeMap::new(), &[]).unwrap()).unwrap();
 }
 
-/// A piece of a drawing of photograph, render, error and depth.
+/// A part of an evaluation image: ground truth, render, error or depth.
 fn piece(drawing: &Image, number: usize) -> Image {
     let mut image = Image::new(SIZE, SIZE, 3);
     for (x, y) in (0..SIZE).flat_map(|x| (0..SIZE).map(move |y| (x, y))) {
@@ -59,12 +59,12 @@ fn piece(drawing: &Image, number: usize) -> Image {
 }
 
 #[test]
-fn lpips_stands_beside_psnr_and_ssim() {
+fn lpips_is_reported_beside_psnr_and_ssim() {
     let place = Place::with_run();
     place.succeeds("eval run");
     let plain = place.json("run/eval-test.json");
     let page = |name: &str| String::from_utf8(place.bytes(&format!("run/{name}/index.html"))).unwrap();
-    // Nothing of it where it was not asked for.
+    // Without the flag there are no LPIPS results.
     assert!(!plain.to_string().contains("lpips") && !page("eval-test").to_lowercase().contains("lpips"));
 
     weights(&place, "vgg.safetensors", VGG);
@@ -75,7 +75,7 @@ fn lpips_stands_beside_psnr_and_ssim() {
     let crc = format!("{:08x}", crc32fast::hash(&place.bytes("vgg.safetensors")));
     assert_eq!(json!([result["lpips_backbone"], result["lpips_crc32"]]), json!(["vgg", crc]));
     assert!(result.get("lpips").is_none() && result["psnr_mean"] == plain["psnr_mean"]);
-    // Of each view, and in the mean; what is drawn is rounded to bytes.
+    // Per view and as a mean; the images are rounded to bytes.
     let lpips = Lpips::open(place.path("vgg.safetensors")).unwrap();
     let views = result["per_view"].as_array().unwrap();
     let figures: Vec<f64> = views.iter().map(|view| view["lpips"].as_f64().unwrap()).collect();
@@ -103,7 +103,7 @@ fn lpips_stands_beside_psnr_and_ssim() {
     assert!(compared.contains("LPIPS") && compared.contains(&format!("  {mean:.4}  ")), "{compared}");
     assert!(compared.contains(&format!("lpips_backbone vgg; lpips_crc32 {crc}")), "{compared}");
 
-    // Of the right halves only, which are too small; of what is masked there is none.
+    // The right halves are too small, and masked images have no LPIPS.
     place.fails_with(
         "eval run --lpips vgg.safetensors --fit-half",
         "`lpips`: `test/r_0` has 12x24 pixels to compare; vgg needs at least 16x16",

@@ -1,4 +1,4 @@
-//! The command line, from outside: the built program on small folders.
+//! The command line: the built program on small folders.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -22,7 +22,7 @@ mod outside;
 mod overwrite;
 #[cfg(unix)]
 mod owners;
-// Scripts stand in for other programs.
+// Scripts replace other programs.
 #[cfg(unix)]
 mod prepare;
 
@@ -40,19 +40,19 @@ mod signals;
 #[cfg(unix)]
 mod view;
 
-/// Settings of an instant model whose steps and views take milliseconds in a build for tests.
+/// Settings of an instant model whose steps and renders take milliseconds in a debug build.
 const SMALL: &str = "--set field.grid.levels=4 --set field.grid.log2_table=10 --set field.density_width=16 \
                      --set field.color_width=16 --set sampler.occupancy.resolution=16 --set sampler.samples=1024 \
                      --set sampler.step=0.02 --set sampler.view_step=0.02 --set sampler.cone=0.03";
 
-/// The same of the preset small, which samples rays hierarchically.
+/// The same for the preset small, which samples hierarchically.
 const CLASSIC: &str = "--preset small --set field.width=16 --set field.view_width=16 --set sampler.proposal.width=16 \
                        --set sampler.batch=64 --set sampler.coarse=16 --set sampler.fine=16";
 
 /// Width and height of the test images.
 const SIZE: usize = 24;
 
-/// The files of a place that many tests begin with.
+/// Files of a place that many tests start from.
 struct Kept {
     root: String,
     files: Vec<(PathBuf, Vec<u8>)>,
@@ -75,7 +75,7 @@ impl Kept {
         Kept { root: root.to_str().unwrap().to_owned(), files }
     }
 
-    /// Another place with these files; where they name their folder, they name the new one.
+    /// A new place with these files; paths of the old place are replaced.
     fn place(&self) -> Place {
         let place = Place::empty();
         self.add_to(&place);
@@ -95,8 +95,8 @@ impl Kept {
     }
 }
 
-/// Programs that tests start inherit which signals are ignored, and a check in the background of a shell ignores some. A
-/// handler, which here does what is usual, is not inherited.
+/// Resets ignored signals: programs inherit them, and background jobs of a shell ignore some. A handler with the
+/// default action is not inherited.
 #[cfg(unix)]
 static SIGNALS: LazyLock<()> = LazyLock::new(|| {
     use signal_hook::consts::{SIGHUP, SIGINT};
@@ -106,7 +106,7 @@ static SIGNALS: LazyLock<()> = LazyLock::new(|| {
     }
 });
 
-/// A temporary folder with a dataset in `scene`; commands run there.
+/// A temporary folder with a dataset in `scene`; commands run in it.
 struct Place(TempDir);
 
 impl Place {
@@ -116,13 +116,13 @@ impl Place {
         Place(tempfile::tempdir().unwrap())
     }
 
-    /// With a small dataset in the Blender format: 6 views to train on, 2 to validate, 3 to test.
+    /// A place with a small dataset in the Blender format: 6 training, 2 validation and 3 test images.
     fn with_scene() -> Self {
         static SCENE: LazyLock<Kept> = LazyLock::new(|| Kept::of(&Place::drawn()));
         SCENE.place()
     }
 
-    /// With a dataset and a run of a few steps in `run`.
+    /// A place with a dataset, and a run of a few steps in `run`.
     fn with_run() -> Self {
         static RUN: LazyLock<Kept> = LazyLock::new(|| {
             let place = Place::with_scene();
@@ -132,7 +132,7 @@ impl Place {
         RUN.place()
     }
 
-    /// Adds a dataset of an unbounded scene in `around`, in nerfstudio's format.
+    /// Adds a dataset of an unbounded scene to `around`, in nerfstudio's format.
     #[cfg(unix)]
     fn add_landscape(&self) {
         static LANDSCAPE: LazyLock<Kept> = LazyLock::new(|| {
@@ -143,7 +143,7 @@ impl Place {
         LANDSCAPE.add_to(self);
     }
 
-    /// [`with_scene`](Self::with_scene), rendered anew.
+    /// [`with_scene`](Self::with_scene), rendered again.
     fn drawn() -> Self {
         let place = Place::empty();
         for (split, views) in [(Split::Train, 6), (Split::Val, 2), (Split::Test, 3)] {
@@ -194,20 +194,20 @@ impl Place {
         String::from_utf8(output.stdout).unwrap()
     }
 
-    /// Fails with one line that starts with the program's name and holds every one of `expected`.
+    /// Checks that a command fails with one line, which starts with the program's name and contains all of `expected`.
     #[track_caller]
     fn fails(&self, arguments: &str, expected: &[&str]) {
         complained(arguments, &self.command(arguments).output().unwrap(), expected);
     }
 
-    /// Fails with this message, after the program's name, and nothing else on standard error.
+    /// Checks that a command fails with this message after the program's name, and nothing else on standard error.
     #[track_caller]
     fn fails_with(&self, arguments: &str, message: &str) {
         complained_of(arguments, &self.command(arguments).output().unwrap(), message);
     }
 }
 
-/// Ended with this message and nothing else on standard error.
+/// Checks that a program ended with this message, and nothing else on standard error.
 #[track_caller]
 fn complained_of(what: &str, output: &Output, message: &str) {
     let said = (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned());
@@ -222,13 +222,13 @@ fn complained(what: &str, output: &Output, expected: &[&str]) {
     assert!(one_line && expected.iter().all(|part| message.contains(part)), "{what}: {message}");
 }
 
-/// The image in a PNG file.
+/// Reads a PNG file.
 fn png(path: &Path) -> Image {
     Image::open(path).unwrap()
 }
 
 #[test]
-fn a_run_is_complete_and_can_be_evaluated() {
+fn run_is_complete_and_can_be_evaluated() {
     let place = Place::with_run();
     let config = place.json("run/config.json");
     assert_eq!(config["raygrad"], env!("CARGO_PKG_VERSION"));
@@ -266,7 +266,7 @@ fn a_run_is_complete_and_can_be_evaluated() {
     let crc = crc32fast::hash(&place.bytes("run/model.safetensors"));
     assert!(model["crc32"] == format!("{crc:08x}") && model["budget"] == json!({ "steps": 3 }), "{model}");
     assert!(printed["threads"] == 3 && !printed["processor"].as_str().unwrap().is_empty());
-    // A page shows the views, the worst first, and needs nothing but the pictures beside it.
+    // The page lists the views, the worst first, and refers only to the images beside it.
     let page = String::from_utf8(place.bytes("run/eval-test/index.html")).unwrap();
     let mut order: Vec<(f64, &str)> =
         views.iter().map(|view| (view["psnr"].as_f64().unwrap(), view["name"].as_str().unwrap())).collect();
@@ -278,11 +278,11 @@ fn a_run_is_complete_and_can_be_evaluated() {
     let table = place.succeeds("eval run --split val --views 1");
     assert!(table.contains("worst: val/r_0 (") && table.contains("val images (as the capture's files say)"), "{table}");
     assert!(table.contains("mean of 1") && table.contains("val/r_0") && !table.contains("val/r_1"), "{table}");
-    // Beside the other result, and not in its place.
+    // In its own file; the other result stays.
     assert_eq!(place.json("run/eval-val-1.json")["split"], "val");
     assert_eq!(place.json("run/eval-test.json"), printed);
     assert!(place.path("run/eval-val-1/000.png").exists() && printed["skip"].is_null());
-    // Side by side with another's.
+    // Compared with another run.
     place.succeeds(&format!("train scene --steps 2 --seed 9 --out other {CLASSIC}"));
     place.fails_with("compare run other", "other: has no eval results: run `raygrad eval` first");
     place.succeeds("eval other");
@@ -295,7 +295,7 @@ fn a_run_is_complete_and_can_be_evaluated() {
     let output = place.command("compare run").output().unwrap();
     assert!(String::from_utf8_lossy(&output.stdout).contains("different images"));
     assert!(output.stderr.is_empty(), "{output:?}");
-    // Its figures are no longer those of its model.
+    // The results are older than the model.
     place.succeeds("train --resume run --steps 4");
     let output = place.command("compare run other").output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
@@ -303,25 +303,25 @@ fn a_run_is_complete_and_can_be_evaluated() {
     std::fs::write(place.path("run/eval-test/unfinished/999.png"), b"half").unwrap();
     let stale = "the model was trained further after this result";
     assert!(output.status.success() && said.matches(stale).count() == 2 && !said.contains("other/"), "{said}");
-    // One at a time.
+    // Only one evaluation may run at a time.
     let lock = std::fs::File::create(place.path("run/eval-test/unfinished.lock")).unwrap();
     lock.lock().unwrap();
     place.fails_with("eval run", "run/eval-test: another raygrad is writing it: wait until it ends");
     drop(lock);
-    // What an evaluation that was killed has left is begun again; what is evaluated anew is not stale.
+    // The remains of a killed evaluation are replaced, and new results are not stale.
     place.succeeds("eval run");
     let left: Vec<_> =
         std::fs::read_dir(place.path("run/eval-test")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert_eq!(left.len(), 4, "three pictures and a page: {left:?}");
-    // A run whose model is gone has its results still.
+    // Results remain if the model is deleted.
     std::fs::remove_file(place.path("other/model.safetensors")).unwrap();
     let output = place.command("compare run other --only eval-test").output().unwrap();
     assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
 }
 
-/// Of many views ten are drawn, evenly spaced, and the three worst.
+/// Of many views, ten evenly spaced ones and the three worst are drawn.
 #[test]
-fn the_worst_of_many_views_are_drawn_too() {
+fn worst_of_many_views_are_drawn() {
     let place = Place::empty();
     place.succeeds(&format!("train --downscale 20 --steps 1 --out run {SMALL}"));
     place.succeeds("eval run --split train");
@@ -342,7 +342,7 @@ fn the_worst_of_many_views_are_drawn_too() {
 }
 
 #[test]
-fn the_doctor_says_what_is_wrong_by_its_exit_code_too() {
+fn doctor_exit_code_is_that_of_the_worst_finding() {
     const SIZE: usize = 64;
     let place = Place::empty();
     std::fs::create_dir_all(place.path("capture/images")).unwrap();
@@ -395,19 +395,19 @@ fn the_doctor_says_what_is_wrong_by_its_exit_code_too() {
 }
 
 #[test]
-fn pictures_and_animations() {
+fn render_writes_images_and_animations() {
     let place = Place::with_run();
     place.succeeds("render run --frames 2");
     let [first, second] = ["0000", "0001"].map(|name| png(&place.path(&format!("run/orbit/{name}.png"))));
     assert_eq!([first.width, first.height], [SIZE, SIZE]);
     assert_ne!(first, second);
     assert!(!place.path("run/orbit/0002.png").exists());
-    // Frames of a longer path stay, and that is said.
+    // Frames of a longer path stay, with a warning.
     let output = place.command("render run --frames 1").output().unwrap();
     assert!(output.status.success() && place.path("run/orbit/0001.png").exists());
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("orbit also holds 1 numbered images of a longer path"), "{said}");
-    // Pictures of an evaluation that is replaced go; nothing else does.
+    // An evaluation removes the images of the previous one, and nothing else.
     std::fs::create_dir(place.path("run/eval-test")).unwrap();
     for name in ["007.png", "0007.png", "7.png", "notes.txt"] {
         std::fs::write(place.path(&format!("run/eval-test/{name}")), "old").unwrap();
@@ -433,7 +433,7 @@ fn pictures_and_animations() {
         frames += 1;
     }
     assert_eq!(frames, 3);
-    // An orbit needs no photographs, and where they went can be said.
+    // An orbit needs no images, and a moved capture can be named.
     std::fs::rename(place.path("scene"), place.path("moved")).unwrap();
     place.succeeds("render run --frames 1 --out one.png");
     place.fails("eval run", &["scene: ", "--scene"]);
@@ -442,7 +442,7 @@ fn pictures_and_animations() {
 }
 
 #[test]
-fn the_embedded_scene_needs_no_files() {
+fn embedded_scene_needs_no_files() {
     let place = Place::empty();
     let printed = place
         .succeeds(&format!("train --steps 1 --downscale 10 --no-positional-encoding --background random {CLASSIC}"));
@@ -468,7 +468,7 @@ fn same_seed_any_threads_give_same_bits() {
 }
 
 #[test]
-fn nothing_is_overwritten() {
+fn train_overwrites_no_folder() {
     let place = Place::with_run();
     let before = place.bytes("run/model.safetensors");
     for name in ["run-2", "run-3"] {
@@ -484,7 +484,7 @@ fn nothing_is_overwritten() {
     );
     assert_eq!(place.bytes("run/model.safetensors"), before);
     assert!(!place.path("scene/config.json").exists());
-    // An empty folder is as good as none.
+    // An empty folder may become a run.
     std::fs::create_dir(place.path("empty")).unwrap();
     place.succeeds(&format!("train scene --steps 1 --out empty {CLASSIC}"));
     std::fs::remove_file(place.path("run/config.json")).unwrap();
@@ -539,7 +539,7 @@ fn absent_images_are_skipped_with_a_warning() {
     assert!(warned.contains("raygrad: warning: scene: the train image `train/r_3` is missing"), "{warned}");
 }
 
-/// The folder of a run that was trained before files held less than the whole grid: such files load for ever.
+/// Runs of version 0.1 stored the whole grid; they must load in all later versions.
 #[test]
 fn run_of_first_version_loads_and_renders_the_same() {
     let place = Place::empty();
@@ -620,7 +620,7 @@ fn bad_runs_are_named() {
 }
 
 #[test]
-fn bad_places_to_write_are_named() {
+fn unwritable_outputs_are_named() {
     let place = Place::with_run();
     place.fails(
         "train scene --preset small --steps 1 --out scene/transforms_test.json/run",
@@ -637,14 +637,14 @@ fn bad_places_to_write_are_named() {
     place.fails("render run --out absent/picture.png", &["absent: cannot be written to"]);
     std::fs::create_dir(place.path("folder.gif")).unwrap();
     place.fails_with("render run --out folder.gif", "folder.gif: is a folder, not a file");
-    // Where pictures should go there is a file.
+    // A file is in the place of the image folder.
     std::fs::write(place.path("run/eval-test"), b"").unwrap();
     place.fails("eval run", &["run/eval-test: cannot be created"]);
     assert_eq!(place.bytes("run/eval-test"), b"");
 }
 
 #[test]
-fn how_many_masks_must_agree_can_be_said() {
+fn carving_votes_are_configurable() {
     let place = Place::with_scene();
     for (flag, expected) in [("", 3), ("--carve 0", 0), ("--carve 5 --skip near-lossless", 5)] {
         place.succeeds(&format!("train scene --steps 1 --out run-{expected} {SMALL} {flag}"));
@@ -658,7 +658,7 @@ fn how_many_masks_must_agree_can_be_said() {
 }
 
 #[test]
-fn codes_and_poses_are_trained_and_read_back() {
+fn embeddings_and_poses_round_trip() {
     let place = Place::with_scene();
     let learned = r#"--set field.appearance_embedding_dim=4 --set poses={"constant":{"rate":0.001}}"#;
     place.succeeds(&format!("train scene --steps 2 --out run {SMALL} {learned}"));
@@ -672,7 +672,7 @@ fn codes_and_poses_are_trained_and_read_back() {
 }
 
 #[test]
-fn cameras_are_corrected_and_said_to_be() {
+fn refined_cameras_are_reported() {
     let place = Place::with_scene();
     let runs = [("", "none", "none"), ("poses,focal,lens", "similarity of the training cameras", "as learned")];
     let glass = ("focal", "focal length and lens as learned", "as learned");
@@ -715,7 +715,7 @@ fn bad_arguments_are_usage_errors() {
     }
     let output = place.command("train --steps 1").env("RAYGRAD_SIMD", "avx").output().unwrap();
     complained("RAYGRAD_SIMD", &output, &["RAYGRAD_SIMD is \"avx\"", "scalar, v3 or v4"]);
-    // Nobody who asks for a page trains without one.
+    // Page options without a page are errors before training.
     for place_of_page in ["--host ::1", "--port 7000"] {
         place.fails_with(
             &format!("train --steps 1 {place_of_page}"),
@@ -726,7 +726,7 @@ fn bad_arguments_are_usage_errors() {
 }
 
 #[test]
-fn a_closed_pipe_is_no_error() {
+fn closed_pipe_is_not_an_error() {
     let place = Place::with_run();
     let mut child = place.command("eval run").stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     drop(child.stdout.take());
@@ -741,7 +741,7 @@ fn ctrl_c_saves_the_model() {
     let place = Place::with_scene();
     let mut command = place.command("train scene --preset small --budget 1h");
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    // The first line of the metrics says that training has begun.
+    // The first line of the metrics is written when training has begun.
     wait(&mut child, || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0));
     let untrained = place.bytes("run/model.safetensors");
     let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
@@ -753,7 +753,7 @@ fn ctrl_c_saves_the_model() {
     place.succeeds("eval run --views 1");
 }
 
-/// Waits until something holds, for as long as the program runs and at most a minute.
+/// Waits for a condition while the program runs, at most a minute.
 #[cfg(unix)]
 fn wait(child: &mut std::process::Child, holds: impl Fn() -> bool) {
     use std::time::{Duration, Instant};
@@ -769,7 +769,7 @@ fn wait(child: &mut std::process::Child, holds: impl Fn() -> bool) {
 }
 
 #[test]
-fn any_quadrature_can_be_chosen_and_comes_back() {
+fn quadrature_is_configurable_and_round_trips() {
     let place = Place::with_scene();
     let set = "--set sampler.samples=512 --set sampler.occupancy.resolution=32 --set field.resolution=16 --set sampler.view_step=0.01";
     for rule in ["left", "piecewise-linear", "gauss2", r#"{"adaptive":{"tolerance":0.01}}"#] {
@@ -791,7 +791,7 @@ fn any_quadrature_can_be_chosen_and_comes_back() {
 fn quadrature_benchmark_writes_tables_and_page() {
     let place = Place::empty();
     let bench = "bench --suite quadrature --quick --out";
-    // One that is killed at its beginning is begun again.
+    // A killed benchmark is repeated.
     let killed = |out: &str, flags: &str| {
         let mut child = place.command(&format!("{bench} {out} {flags}"));
         let mut child = child.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
@@ -813,12 +813,12 @@ fn quadrature_benchmark_writes_tables_and_page() {
         assert!(text(&format!("{figure}.svg")).contains("midpoint"));
         assert!(png(&place.path(&format!("results/{figure}.png"))).width > 1000);
     }
-    // One that is there stays until the next has come to its end.
+    // The existing report stays until the next one is complete.
     killed("results", "");
     assert_eq!(text("report.html"), page);
     std::fs::write(place.path("file"), "").unwrap();
     place.fails(&format!("{bench} file"), &["file: cannot be created"]);
-    // Files of others are replaced where that is asked for.
+    // Foreign files are replaced on request.
     std::fs::create_dir(place.path("others")).unwrap();
     std::fs::write(place.path("others/plot.png"), "").unwrap();
     place.fails_with(

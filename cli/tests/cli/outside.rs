@@ -1,5 +1,5 @@
-//! Captures whose files name places outside of them: these may be read, nothing is written there, and what is there is copied
-//! into a new dataset only where that is allowed.
+//! Captures whose files name paths outside of their folder. Commands read these and write nothing there. A new dataset
+//! contains copies of them only with the flag that allows it.
 
 use super::{Place, SMALL};
 use raygrad::nerf::Image;
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 const SIZE: usize = 24;
 
-/// Where photographs say that they are, from the folder of their capture; all of these exist.
+/// Paths of images as a capture may name them, relative to its folder; all exist.
 fn names(place: &Place) -> Vec<String> {
     let absolute = place.path("elsewhere/absolute.png").to_str().unwrap().to_owned();
     let inside = (0..3).map(|i| format!("images/{i}.png"));
@@ -22,10 +22,10 @@ fn names(place: &Place) -> Vec<String> {
         .collect()
 }
 
-/// What a photograph is called, and where its camera is.
+/// The name of an image and its camera-to-world matrix.
 type Named = (String, [[f64; 4]; 4]);
 
-/// A place whose folder `work/scene` has the cameras of photographs in it and around it.
+/// A place whose folder `work/scene` has cameras of images inside and outside of it.
 fn place() -> (Place, Vec<Named>) {
     let place = Place::empty();
     for folder in ["work/scene/images", "work/masks", "elsewhere"] {
@@ -46,7 +46,7 @@ fn place() -> (Place, Vec<Named>) {
     (place, views)
 }
 
-/// All files of a place but those in some folders, with what they hold.
+/// All files of a place except those in some folders, with their contents.
 fn files(place: &Place, but: &[&str]) -> BTreeMap<PathBuf, Vec<u8>> {
     fn walk(folder: &Path, but: &[PathBuf], out: &mut BTreeMap<PathBuf, Vec<u8>>) {
         for entry in std::fs::read_dir(folder).unwrap() {
@@ -65,19 +65,19 @@ fn files(place: &Place, but: &[&str]) -> BTreeMap<PathBuf, Vec<u8>> {
     out
 }
 
-/// Runs commands in `work`, each of which writes `work/out` alone, or `work/run`.
+/// Runs commands in `work` that may write only to `work/out` or `work/run`.
 fn only_there(place: &Place, commands: &[&str]) {
     for arguments in commands {
         let before = files(place, &["work/out", "work/run", "work/out.json"]);
         let output = place.command(arguments).current_dir(place.path("work")).output().unwrap();
-        // The doctor may have found something.
+        // The doctor may have findings.
         assert!(matches!(output.status.code(), Some(0 | 3)), "{arguments}: {output:?}");
         let after = files(place, &["work/out", "work/run", "work/out.json"]);
         assert_eq!(before.keys().collect::<Vec<_>>(), after.keys().collect::<Vec<_>>(), "{arguments}");
         assert!(before == after, "{arguments}: a file has changed");
         let written = place.path("work/out");
         if written.is_dir() {
-            // As many photographs as there are, in it.
+            // The output contains all images.
             let inside = files(place, &[]).into_keys().filter(|path| path.starts_with(&written));
             let pictures = inside.filter(|path| path.extension().is_some_and(|ending| ending == "png")).count();
             assert!(!arguments.contains("--to") || pictures >= 7, "{arguments}");
@@ -88,7 +88,7 @@ fn only_there(place: &Place, commands: &[&str]) {
 }
 
 #[test]
-fn transforms_json_paths_are_never_written_to() {
+fn transforms_paths_outside_are_never_written() {
     let (place, views) = place();
     let mask = "../../elsewhere/mask.png";
     let frames = views.iter().enumerate().map(|(i, (name, matrix))| {
@@ -116,15 +116,15 @@ fn transforms_json_paths_are_never_written_to() {
             "doctor scene --out out",
         ],
     );
-    // Names are kept as names: the first one is held out.
+    // Names are kept; the first one is held out.
     assert_eq!(place.json("work/run/eval-test-fast.json")["per_view"][0]["name"], "../../x.png");
     assert!(place.json("work/run/config.json")["photographs"].as_array().unwrap().contains(&json!("../masks/z.png")));
-    // Blender's files have no masks.
+    // Blender's format has no masks.
     let mut plain = frames.clone();
     plain.iter_mut().for_each(|frame| drop(frame.as_object_mut().unwrap().remove("mask_path")));
     write(&plain);
     only_there(&place, &["prepare scene --to blender --undistort --out out --allow-outside"]);
-    // Names that no file has.
+    // Names that no file can have.
     for name in ["a\0b.png", "a\nb.png"] {
         let mut frames = frames.clone();
         frames[1]["file_path"] = json!(name);
@@ -135,7 +135,7 @@ fn transforms_json_paths_are_never_written_to() {
             .output();
         super::complained(name, &output.unwrap(), &["file_path", "without control characters"]);
     }
-    // A run whose photographs are said to be elsewhere is not gone on with.
+    // A run whose configuration names images elsewhere is not resumed.
     write(&frames);
     let mut config = place.json("work/run/config.json");
     config["photographs"][0] = json!("../../../x");
@@ -145,7 +145,7 @@ fn transforms_json_paths_are_never_written_to() {
 }
 
 #[test]
-fn colmap_paths_are_never_written_to() {
+fn colmap_paths_outside_are_never_written() {
     let (place, views) = place();
     std::fs::create_dir_all(place.path("work/scene/sparse/0")).unwrap();
     let focal = 0.5 * SIZE as f64 / (0.5_f64 * 0.69).tan();
@@ -156,14 +156,14 @@ fn colmap_paths_are_never_written_to() {
     )
     .unwrap();
     std::fs::write(place.path("work/scene/sparse/0/points3D.txt"), "").unwrap();
-    // COLMAP's images are looked for in `images`.
+    // COLMAP's images are in `images`.
     let name = |name: &str| match name.strip_prefix("images/") {
         Some(inside) if !inside.starts_with("..") => inside.to_owned(),
         _ if name.starts_with('/') => name.to_owned(),
         _ => format!("../{name}"),
     };
     let lines = views.iter().enumerate().map(|(i, (file, m))| {
-        // From where a camera is, looking along -z, to where the world is from it, looking along z.
+        // From a camera-to-world matrix that looks along -z to a world-to-camera one that looks along z.
         let axes = [0, 1, 2].map(|c| [m[0][c], m[1][c], m[2][c]]);
         let rows = [axes[0], axes[1].map(|x| -x), axes[2].map(|x| -x)].map(DVec3::from);
         let matrix = DMat3::from_cols(rows[0], rows[1], rows[2]).transpose();
@@ -185,7 +185,7 @@ fn colmap_paths_are_never_written_to() {
             "export run --to nerfstudio out --allow-outside",
         ],
     );
-    // Its points lead elsewhere.
+    // A points file that is a link to elsewhere.
     #[cfg(unix)]
     {
         let points = place.path("work/scene/sparse/0/points3D.txt");
@@ -198,7 +198,7 @@ fn colmap_paths_are_never_written_to() {
         refused(&place, convert, &["images.txt: ", "points3D.txt lies outside of", "add --allow-outside to copy it"]);
         only_there_converted(&place, &format!("{convert} --allow-outside"));
         std::fs::write(place.path("elsewhere/points.txt"), "").unwrap();
-        // From the folder of the model, as from its scene.
+        // From the folder of the model as from that of the scene.
         only_there_converted(&place, "prepare scene/sparse/0 --to nerfstudio --out out");
     }
     std::fs::write(place.path("work/scene/sparse/0/images.txt"), lines.replace("0.png", "a\0b.png")).unwrap();
@@ -206,7 +206,7 @@ fn colmap_paths_are_never_written_to() {
     super::complained("colmap", &output, &["images.txt", "has a control character"]);
 }
 
-/// Runs a command in `work` that fails, says so, and leaves nothing.
+/// Runs a command in `work` that must fail with a message and leave no file.
 #[track_caller]
 fn refused(place: &Place, arguments: &str, expected: &[&str]) {
     let before = files(place, &[]);
@@ -224,7 +224,7 @@ fn private_files_are_not_copied_into_a_dataset() {
     }
     let png = |name: &str| std::fs::copy(place.path("work/scene/images/0.png"), place.path(name)).unwrap();
     png("work/scene/images/mask.png");
-    // A picture of which all but its beginning is something else.
+    // An image file that contains other data after its beginning.
     let mut cut = place.bytes("work/scene/images/0.png");
     let half = cut.len() / 2;
     cut[half..].fill(b'k');
@@ -232,7 +232,7 @@ fn private_files_are_not_copied_into_a_dataset() {
     let point = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n";
     std::fs::write(place.path("elsewhere/points.ply"), point).unwrap();
     std::fs::write(place.path("work/scene/points.ply"), point).unwrap();
-    // A file of this name leads elsewhere.
+    // A link with an image's name that leads elsewhere.
     #[cfg(unix)]
     std::os::unix::fs::symlink(place.path("elsewhere/absolute.png"), place.path("work/scene/images/link.png")).unwrap();
     let write = |field: &str, value: &Value| {
@@ -248,7 +248,7 @@ fn private_files_are_not_copied_into_a_dataset() {
     };
     let secret = place.path("elsewhere/secret.txt").to_str().unwrap().to_owned();
     let convert = "prepare scene --to nerfstudio --out out";
-    // Outside, by a path or by a link; and what is no depths, mask or image, wherever it is.
+    // Paths outside, direct or by a link; and files that are no depth, mask or image.
     for (field, value) in [
         ("depth_file_path", secret.as_str()),
         ("depth_file_path", "../../elsewhere/secret.txt"),
@@ -284,16 +284,16 @@ fn private_files_are_not_copied_into_a_dataset() {
         write(field, &json!(value));
         refused(&place, &format!("{convert} --allow-outside"), &[expected]);
     }
-    // What lies inside and is what it claims to be is copied as ever.
+    // Valid files inside are copied.
     write("mask_path", &json!("images/mask.png"));
     only_there_converted(&place, convert);
-    // Training may read what it is told to.
+    // Training may read files outside.
     write("mask_path", &json!("../../elsewhere/mask.png"));
     only_there(&place, &[&format!("train scene --steps 3 --out run {SMALL}")]);
     refused(&place, "export run --to nerfstudio out", &["lies outside of", "--allow-outside"]);
 }
 
-/// Converts, and removes what that made.
+/// Converts, and removes the output.
 fn only_there_converted(place: &Place, arguments: &str) {
     let output = place.command(arguments).current_dir(place.path("work")).output().unwrap();
     assert!(output.status.success(), "{arguments}: {output:?}");

@@ -1,9 +1,9 @@
-//! Files of users are not replaced, and every command works again on its own output.
+//! Commands replace their own output and no other files.
 
 use super::{Place, SMALL};
 use raygrad::nerf::Image;
 
-/// With a run, and a photograph at the given places.
+/// A place with a run, and an image at the given paths.
 fn place(photographs: &[&str]) -> Place {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 2 --scene-type unbounded --out run {SMALL}"));
@@ -18,7 +18,7 @@ fn photograph() -> Image {
     Image { width: 4, height: 3, channels: 3, data: vec![0.25; 36] }
 }
 
-/// Fails because that file is in the way, and leaves it as it is.
+/// Checks that a command fails because of this file and leaves it unchanged.
 #[track_caller]
 fn refuses(place: &Place, arguments: &str, file: &str) {
     let before = place.bytes(file);
@@ -53,7 +53,7 @@ fn foreign_outputs_are_refused_own_ones_replaced() {
             && !place.path("video.gif").exists()
     );
     std::fs::remove_dir_all(place.path("video.gif.frames")).unwrap();
-    // Each works again on its own output, also when the model is another by then; and is refused as another job.
+    // Each command replaces its own output, also after the model changed; another command does not.
     let commands =
         |out: &str| [format!("render run {frames} --out {out}"), format!("render run {frames} --fov 30 --out {out}")];
     let outputs = ["frames", "video.gif", "video.apng", "picture.png"];
@@ -86,22 +86,22 @@ fn foreign_outputs_are_refused_own_ones_replaced() {
         place.succeeds(&format!("export run {export}"));
     }
     refuses(&place, "export run mesh.ply --iso-value 1e-6 --resolution 10", "mesh.ply");
-    // Another run is another job, wherever it is called from.
+    // Another run counts as another command, from any folder.
     place.succeeds(&format!("train scene --steps 2 --out other {SMALL}"));
     refuses(&place, &format!("render other {frames} --out video.gif"), "video.gif");
     refuses(&place, "export other cameras.json", "cameras.json");
     place.succeeds(&format!("render ./other/../run/ {frames} --out video.gif"));
-    // What is given to be replaced is.
+    // `--overwrite` replaces it.
     place.succeeds(&format!("export run {transforms} --overwrite"));
     assert!(place.json(transforms)["frames"].is_array());
-    // What a picture shows is all that its flags say.
+    // All flags that change the image count.
     for flag in ["--show depth", "--background black", "--skip off", "--precision f64", "--radius 2"] {
         refuses(&place, &format!("render run {frames} {flag} --out picture.png"), "picture.png");
     }
     refuses(&place, &format!("render run {frames} --out deep"), "deep/0000.png");
     refuses(&place, &format!("render run {frames} --save normals --out deep"), "deep/0000.png");
     refuses(&place, &format!("render run {frames} --save depth --depth-unit 0.5 --out deep"), "deep/depth/0000.png");
-    // A run's own folder of pictures needs no word.
+    // The run's own image folder is replaced without a flag.
     place.succeeds("render run --frames 1");
     place.succeeds("render run --frames 2 --fov 30");
 }
@@ -117,7 +117,7 @@ fn files_of_a_run_are_never_an_output() {
         ("render run --frames 1 --out run/previews/a.png --overwrite", "previews"),
         ("render run --frames 1 --out run/eval-test/0.png --overwrite", "eval-test"),
         ("export run run/Lock --to colmap", "lock"),
-        // Nor of another run.
+        // Files of another run neither.
         ("export run other/config.json --overwrite", "config.json"),
         ("render run --frames 1 --out other/tensorboard/0 --overwrite", "tensorboard"),
     ] {
@@ -125,13 +125,13 @@ fn files_of_a_run_are_never_an_output() {
         place.fails(arguments, &[&format!("`{name}` belongs to a run: choose another name")]);
     }
     place.succeeds("train --resume run --steps 3");
-    // What lies beside them is.
+    // New files beside them are allowed.
     place.succeeds("export run run/cameras.json");
     place.succeeds("render run --frames 1 --out run/picture.png");
 }
 
 #[test]
-fn endings_that_are_not_known_are_named() {
+fn unknown_file_extensions_are_named() {
     let place = place(&[]);
     std::fs::write(place.path("walk.mp4"), b"footage").unwrap();
     for out in ["walk.mp4", "cameras", "cameras.txt", "mesh.stl"] {
@@ -156,7 +156,7 @@ fn doctor_replaces_its_own_files_alone() {
     let place = Place::with_scene();
     photograph().save_png(place.path("scene/cameras.png")).unwrap();
     let run = |arguments: &str| place.command(arguments).output().unwrap();
-    // Warnings of a small capture are no errors of the command.
+    // Warnings about a small capture are not errors of the command.
     for out in ["", "--out again"] {
         for _ in 0..2 {
             assert_eq!(run(&format!("doctor scene {out}")).status.code(), Some(3), "{out}");
@@ -169,7 +169,7 @@ fn doctor_replaces_its_own_files_alone() {
 }
 
 #[test]
-fn videos_of_ffmpeg_say_what_they_are_of() {
+fn ffmpeg_videos_carry_the_mark_of_their_command() {
     if !super::render::has_ffmpeg() {
         return;
     }

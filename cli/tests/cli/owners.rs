@@ -6,7 +6,7 @@ use super::signals::{send, stopped};
 use super::{Place, complained, wait};
 use std::process::{Child, Output, Stdio};
 
-/// Begins a long training in `run`, with many checkpoints, and waits for some of them.
+/// Begins a long training in `run` with many checkpoints, and waits for some of them.
 fn begin(place: &Place, flags: &str) -> Child {
     let arguments = format!("train scene --budget 1h --checkpoint-every 0.05s --out run {flags} {SMALL}");
     let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
@@ -17,7 +17,7 @@ fn begin(place: &Place, flags: &str) -> Child {
     child
 }
 
-/// What a program says that ends by itself, which it does within a minute.
+/// The output of a program that ends by itself within a minute.
 fn ended(mut child: Child) -> Output {
     let start = std::time::Instant::now();
     while child.try_wait().unwrap().is_none() {
@@ -29,7 +29,7 @@ fn ended(mut child: Child) -> Output {
     child.wait_with_output().unwrap()
 }
 
-/// The last line that a program complained with is that it lost its folder.
+/// Checks that the last error of a program is the loss of its folder.
 #[track_caller]
 fn lost(what: &str, mut output: Output) {
     let said = String::from_utf8(output.stderr).unwrap();
@@ -39,7 +39,7 @@ fn lost(what: &str, mut output: Output) {
     complained(what, &output, &[expected, "raygrad train --resume"]);
 }
 
-/// All files of a folder with what they hold.
+/// All files of a folder with their contents.
 fn contents(place: &Place, folder: &str) -> Vec<(std::path::PathBuf, Vec<u8>)> {
     let mut found = vec![];
     let mut folders = vec![place.path(folder)];
@@ -58,13 +58,13 @@ fn contents(place: &Place, folder: &str) -> Vec<(std::path::PathBuf, Vec<u8>)> {
 }
 
 #[test]
-fn a_training_whose_folder_is_replaced_stops() {
+fn training_stops_if_its_folder_is_replaced() {
     let place = Place::with_scene();
     let small = format!("train scene --steps 40 --checkpoint-every 0.02s {SMALL}");
     place.succeeds(&format!("{small} --out whole"));
     for moves in [false, true] {
         let first = begin(&place, "");
-        // It does nothing while another one begins and ends.
+        // It is stopped while another one begins and ends.
         stopped(&first, || {
             if moves {
                 std::fs::rename(place.path("run"), place.path("moved")).unwrap();
@@ -86,8 +86,8 @@ fn a_training_whose_folder_is_replaced_stops() {
 }
 
 #[test]
-fn a_training_whose_run_is_taken_over_stops() {
-    // As where a file system has no locks: another program has named itself.
+fn training_stops_if_its_run_is_taken_over() {
+    // As on a file system without locks: another program wrote its name.
     let place = Place::with_scene();
     for flags in ["--steps 100000", "--checkpoint-every 1h"] {
         let first = begin(&place, "");
@@ -96,7 +96,7 @@ fn a_training_whose_run_is_taken_over_stops() {
             contents(&place, "run")
         });
         lost(flags, ended(first));
-        // A file that was being written in that moment is finished.
+        // A file being written at that moment is completed.
         let written: Vec<_> = contents(&place, "run").into_iter().filter(|file| !before.contains(file)).collect();
         assert!(written.len() <= 1, "{:?}", written.iter().map(|(path, _)| path).collect::<Vec<_>>());
         place.succeeds("train --resume run --steps 1");
@@ -105,18 +105,18 @@ fn a_training_whose_run_is_taken_over_stops() {
 }
 
 #[test]
-fn a_folder_that_is_removed_is_made_again() {
+fn training_recreates_a_removed_folder() {
     let place = Place::with_scene();
     let mut first = begin(&place, "--tensorboard");
     stopped(&first, || std::fs::remove_dir_all(place.path("run")).unwrap());
     let is_there = |name: &str| place.path(&format!("run/{name}")).exists();
     wait(&mut first, || ["checkpoints", "metrics.jsonl", "tensorboard", "model.safetensors"].into_iter().all(is_there));
-    // It would come back however often one removes it.
+    // It recreates the folder each time it is removed.
     place.fails_with(
         &format!("train scene --steps 3 --out run {SMALL}"),
         "run: another raygrad is training it: stop that one or choose another --out",
     );
-    // Without its lock the run is still there, and is kept.
+    // Without its lock the run is still there and stays.
     let metrics = || String::from_utf8(place.bytes("run/metrics.jsonl")).unwrap();
     wait(&mut first, || metrics().lines().count() > 3);
     let before = stopped(&first, || {
@@ -137,7 +137,7 @@ fn a_folder_that_is_removed_is_made_again() {
 }
 
 #[test]
-fn an_evaluation_whose_folder_is_taken_over_stops() {
+fn eval_stops_if_its_folder_is_taken_over() {
     let place = Place::with_run();
     for gone in [false, true] {
         let name = place.path("run/eval-test-f64/unfinished.lock.owner");

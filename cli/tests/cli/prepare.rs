@@ -1,4 +1,4 @@
-//! `raygrad prepare` of videos and photographs, with scripts in place of ffmpeg and colmap.
+//! `raygrad prepare` on videos and images, with scripts instead of ffmpeg and COLMAP.
 
 use super::{CLASSIC, Place, complained, complained_of, wait};
 use raygrad::nerf::Image;
@@ -7,7 +7,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-/// In place of ffmpeg: writes a line of its arguments, and 30 frames of which the second of three is the sharp one.
+/// Replaces ffmpeg: logs its arguments and writes 30 frames, of which the second of every three is sharp.
 const FFMPEG: &str = r#"#!/bin/sh
 echo "ffmpeg $*" >> "$LOG"
 case "$*" in
@@ -29,7 +29,7 @@ done
 echo progress=end
 "#;
 
-/// In place of colmap: registers all photographs but the last two, in the second of two models.
+/// Replaces colmap: registers all images but the last two, in the second of two models.
 const COLMAP: &str = r#"#!/bin/sh
 echo "colmap $*" >> "$LOG"
 case "$*" in "-h"|*" -h") echo "  --$GPU.use_gpu arg (=1)"; exit 0 ;; esac
@@ -59,7 +59,7 @@ for name in $(ls "$images"); do
 done
 "#;
 
-/// A folder with both scripts in `bin`, a video, and photographs in `photos`.
+/// A folder with both scripts in `bin`, a video, and images in `photos`.
 pub fn place() -> Place {
     let place = Place::empty();
     std::fs::create_dir(place.path("bin")).unwrap();
@@ -68,7 +68,7 @@ pub fn place() -> Place {
         std::fs::write(&path, script).unwrap();
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
     }
-    // What the scripts need, and no more: a system may have the real ones.
+    // Only the tools that the scripts need: a system may have the real programs.
     for tool in ["cp", "dirname", "ls", "mkdir", "sleep", "wc"] {
         let there = ["/bin", "/usr/bin"].map(|folder| std::path::Path::new(folder).join(tool));
         let there = there.iter().find(|path| path.exists()).unwrap();
@@ -85,7 +85,7 @@ pub fn place() -> Place {
     place
 }
 
-/// A JPEG of 16 x 8 pixels in stripes, with an EXIF orientation.
+/// A JPEG of 16 x 8 pixels with stripes and an EXIF orientation.
 fn jpeg(period: usize, orientation: u8) -> Vec<u8> {
     let file = tempfile::Builder::new().suffix(".jpg").tempfile().unwrap();
     let stripe = |x: usize| if x % period < period / 2 { 1.0 } else { 0.0 };
@@ -119,7 +119,7 @@ fn log(place: &Place) -> String {
     String::from_utf8(place.bytes("log")).unwrap()
 }
 
-/// Whether a line of the log has all of these in this order.
+/// Returns true if a line of the log contains all of these in this order.
 fn ran(place: &Place, parts: &[&str]) -> bool {
     log(place).lines().any(|line| {
         let mut rest = line;
@@ -127,7 +127,7 @@ fn ran(place: &Place, parts: &[&str]) -> bool {
     })
 }
 
-/// What is in the folder of the place, but for what was put there.
+/// The new files in the folder of the place.
 fn made(place: &Place) -> Vec<String> {
     let there = ["bin", "walk.mp4", "photos", "sharp.jpg", "soft.jpg", "log"];
     let entries = std::fs::read_dir(place.path("")).unwrap();
@@ -136,16 +136,16 @@ fn made(place: &Place) -> Vec<String> {
 }
 
 #[test]
-fn a_video_becomes_a_dataset_of_its_sharp_frames() {
+fn video_becomes_a_dataset_of_sharp_frames() {
     let place = place();
     let said = succeeds(&place, "prepare walk.mp4 --out made --frames 10");
     assert!(said.contains("images   10 sharp frames from walk.mp4\n"), "{said}");
     assert!(said.contains("cameras  8 of 10 images registered, in the largest of 2 models\n"), "{said}");
     assert!(said.contains("no pose  frame_00009.jpg, frame_00010.jpg\n"), "{said}");
-    // The doctor has looked at it: of cameras in a row that look the same way there is something to say.
+    // The doctor ran: cameras in a row that look the same way give findings.
     assert!(said.contains("written: made/doctor/cameras.png, made/doctor/doctor.html\n"), "{said}");
     assert!(said.contains("\nnext     raygrad doctor made ") && said.contains("raygrad train made "), "{said}");
-    // Three candidates for each frame: 30 of 10 seconds.
+    // Three candidates per frame: 30 from 10 seconds.
     assert!(ran(&place, &["ffmpeg ", "-progress pipe:1", "walk.mp4", "fps=3.000000", "-q:v 1", "%06d.jpg"]));
     assert!(ran(
         &place,
@@ -164,7 +164,7 @@ fn a_video_becomes_a_dataset_of_its_sharp_frames() {
     );
     assert!(place.path("made/sparse/0/cameras.txt").exists() && !place.path("made/sparse/1").exists());
     assert_eq!(std::fs::metadata(place.path("made")).unwrap().permissions().mode() & 0o700, 0o700);
-    // It is a dataset, and no second one is written over it.
+    // It is a dataset, and no second one overwrites it.
     place.succeeds(&format!("train made --scene-type bounded --steps 1 {CLASSIC}"));
     complained("again", &run(&place, "prepare walk.mp4 --out made"), &["made: is not empty", "--out"]);
 }
@@ -173,7 +173,7 @@ fn a_video_becomes_a_dataset_of_its_sharp_frames() {
 fn images_become_an_upright_dataset() {
     let place = place();
     std::fs::write(place.path("photos/notes.txt"), "").unwrap();
-    // Stored across, shown upright: another size than the rest, so that each has its own camera.
+    // Stored in landscape, shown in portrait: the size differs, so each image has its own camera.
     std::fs::write(place.path("photos/turned.jpg"), jpeg(4, 6)).unwrap();
     let said = succeeds(&place, "prepare photos --out made --lens fisheye");
     assert!(said.contains("images   6 images from photos\ncameras  4 of 6 images"), "{said}");
@@ -184,7 +184,7 @@ fn images_become_an_upright_dataset() {
     assert_eq!(place.bytes("made/images/0.JPG"), place.bytes("photos/0.JPG"));
     assert_eq!(Photo::size_of_file(place.path("made/images/turned.jpg")).unwrap(), [[8, 16]; 2]);
     assert!(!place.path("made/images/notes.txt").exists());
-    // Newer versions of COLMAP have another name for the graphics processor.
+    // Newer versions of COLMAP have another name for the GPU option.
     std::fs::remove_dir_all(place.path("made")).unwrap();
     let output = command(&place, "prepare photos --out made").env("GPU", "FeatureExtraction").output().unwrap();
     assert!(
@@ -209,7 +209,7 @@ fn missing_programs_are_named_with_install_commands() {
         &bare("prepare photos --out made"),
         &["`colmap`: is not on the PATH", &install("colmap"), "winget"],
     );
-    // Faults of the input come before those of the machine.
+    // Input errors come before missing programs.
     std::fs::create_dir(place.path("empty")).unwrap();
     complained("empty", &bare("prepare empty --out made"), &["empty: holds no images"]);
     std::fs::write(place.path("one.heic"), "").unwrap();
@@ -321,7 +321,7 @@ fn many_images_are_matched_in_sequence() {
 fn linked_images_are_copied_if_allowed() {
     use std::os::unix::fs::symlink;
     let place = place();
-    // Within the folder of photographs, whose other files are none: links that lead to its neighbours lead out of it.
+    // The input holds links alone; they lead to its parent folder, which is outside of the input.
     std::fs::create_dir_all(place.path("photos/linked")).unwrap();
     for i in 0..4 {
         symlink(place.path(&format!("photos/{i}.JPG")), place.path(&format!("photos/linked/{i}.jpg"))).unwrap();
@@ -331,7 +331,7 @@ fn linked_images_are_copied_if_allowed() {
     complained("links", &run(&place, "prepare photos/linked --out made"), &expected);
     assert_eq!(made(&place), [""; 0]);
     succeeds(&place, "prepare photos/linked --out made --allow-outside");
-    // Nor is what is no photograph, whatever it is called.
+    // Files that are no images are not copied, whatever their extension.
     std::fs::create_dir(place.path("photos/odd")).unwrap();
     let whole = std::fs::read(place.path("photos/0.JPG")).unwrap();
     std::fs::write(place.path("photos/odd/0.jpg"), &whole[..whole.len() / 2]).unwrap();
@@ -339,7 +339,7 @@ fn linked_images_are_copied_if_allowed() {
 }
 
 #[test]
-fn a_dataset_goes_to_where_a_link_leads() {
+fn prepare_follows_a_link_as_output() {
     let place = place();
     std::fs::create_dir(place.path("disk")).unwrap();
     std::os::unix::fs::symlink(place.path("disk"), place.path("made")).unwrap();

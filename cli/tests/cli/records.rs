@@ -1,4 +1,4 @@
-//! What a run leaves beside its model: event files for TensorBoard, a summary, an exit code.
+//! The records of a run beside its model: TensorBoard event files, a summary, an exit code.
 
 use super::Place;
 use super::SMALL;
@@ -6,8 +6,8 @@ use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
-/// Prints what TensorBoard's two readers have of a folder: of each tag the steps and values of its numbers, and the steps and
-/// sizes of its pictures.
+/// Prints the contents of a folder by TensorBoard's two readers: steps and values of scalars, steps and sizes of
+/// images.
 const READER: &str = r#"
 import json, sys
 from tensorboard.backend.event_processing import event_accumulator, plugin_event_accumulator
@@ -28,7 +28,7 @@ for tags in [scalars, tensors]:
 print(json.dumps({"scalars": scalars, "images": images, "tensors": tensors, "shown": shown}))
 "#;
 
-/// The Python that has TensorBoard: `RAYGRAD_PYTHON`, or the one that is installed.
+/// The Python with TensorBoard: `RAYGRAD_PYTHON`, or the installed one.
 fn python() -> Option<String> {
     let python = std::env::var("RAYGRAD_PYTHON").unwrap_or_else(|_| "python3".into());
     let imported = Command::new(&python).args(["-c", "import tensorboard"]).stderr(Stdio::null()).status();
@@ -52,10 +52,10 @@ fn tensorboard_reads_metrics_of_a_resumed_run() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 40 --checkpoint-every 0.001s --tensorboard --out run {SMALL}"));
     assert_eq!(event_files(&place, "run").len(), 1);
-    // As if it had been killed after step 39, and its later steps were other ones.
+    // As if it had been killed after step 39, with different later steps.
     std::fs::remove_file(place.path("run/checkpoints/00000040.checkpoint")).unwrap();
     place.succeeds("train --resume run --steps 60");
-    // A run that was not to have any has none.
+    // A run without the flag has no event files.
     assert_eq!(event_files(&place, "run").len(), 2);
     place.succeeds(&format!("train scene --steps 1 --out other {SMALL}"));
     assert!(!place.path("other/tensorboard").exists());
@@ -88,7 +88,8 @@ fn tensorboard_reads_metrics_of_a_resumed_run() {
     let speed = last["rays"].as_f64().unwrap() / last["train_seconds"].as_f64().unwrap();
     let found = &read["scalars"]["train/rays_per_second"][6];
     assert!(found[0] == 60 && (found[1].as_f64().unwrap() / speed - 1.0).abs() < 1e-6, "{found} {speed}");
-    // The preview at the end of the first part is of a step that was taken again; a slow machine makes some in between.
+    // The preview at the end of the first part belongs to a step that was repeated. A slow machine writes others in
+    // between.
     let pictures = read["images"]["preview/picture"].as_array().unwrap();
     assert_eq!(pictures.last(), Some(&json!([60, 48, 24])));
     let steps: Vec<u64> = pictures.iter().map(|picture| picture[0].as_u64().unwrap()).collect();
@@ -110,9 +111,9 @@ fn event_file_failures_do_not_end_a_run() {
     assert_eq!(metrics(&place, "run").len(), 3);
 }
 
-/// A shell that ignores that files get too large makes writing fail where a disk would be full.
+/// A shell that ignores SIGXFSZ makes writes fail at the size limit, as on a full disk.
 #[test]
-fn of_a_line_that_does_not_fit_nothing_stays() {
+fn partial_metrics_line_is_removed() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 20 --out run {SMALL}"));
     let path = place.path("run/metrics.jsonl");
@@ -132,7 +133,7 @@ fn of_a_line_that_does_not_fit_nothing_stays() {
 }
 
 #[test]
-fn a_summary_says_how_a_run_ended_and_what_it_took() {
+fn summary_has_the_end_and_cost_of_a_run() {
     let place = Place::with_scene();
     let train = format!("train scene --seed 7 --steps 30 --checkpoint-every 0.001s --threads 2 --out run {SMALL}");
     place.succeeds(&train);
@@ -159,7 +160,7 @@ fn a_summary_says_how_a_run_ended_and_what_it_took() {
         let memory = number(&summary, "peak_memory_bytes");
         assert!((2e6..2e10).contains(&memory) && summary["processor"] != "unknown", "{summary}");
     }
-    // It goes on: times and counts add up, and a killed part is not lost.
+    // Resumed: times and counts add up, including those of a killed part.
     place.succeeds("train --resume run --steps 50");
     let later = place.json("run/summary.json");
     assert_eq!([&later["steps"], &later["resumed"], &later["ended"]], [&json!(50), &json!(1), &json!("done")]);
@@ -173,11 +174,11 @@ fn a_summary_says_how_a_run_ended_and_what_it_took() {
     child.wait().unwrap();
     let killed = place.json("run/summary.json");
     assert_eq!([&killed["ended"], &killed["resumed"]], [&Value::Null, &json!(2)]);
-    // What is damaged is no reason not to go on.
+    // A damaged summary does not prevent resuming.
     std::fs::write(place.path("run/summary.json"), b"{").unwrap();
     place.succeeds(&format!("train --resume run --steps {}", steps_of_last_checkpoint(&place) + 1));
     assert_eq!(place.json("run/summary.json")["resumed"], 1);
-    // In vain.
+    // Training that must diverge.
     let arguments = "train --downscale 10 --steps 300 --set schedule.linear.from=1e30 --set sampler.occupancy.resolution=16 --out vain";
     assert_eq!(place.command(arguments).output().unwrap().status.code(), Some(1));
     let vain = place.json("vain/summary.json");
@@ -191,9 +192,9 @@ fn steps_of_last_checkpoint(place: &Place) -> u64 {
     entries.filter_map(|entry| step(entry.unwrap().path())).max().unwrap()
 }
 
-/// Those of `doctor` alone are asked for in `the_doctor_says_what_is_wrong_by_its_exit_code_too`.
+/// `doctor_exit_code_is_that_of_the_worst_finding` covers the codes of `doctor`.
 #[test]
-fn exit_codes_are_as_the_help_says() {
+fn exit_codes_equal_the_help() {
     let place = Place::with_scene();
     let code = |arguments: &str| place.command(arguments).output().unwrap().status.code();
     let mut child = place.command(&format!("train scene --budget 1h --out long {SMALL}"));

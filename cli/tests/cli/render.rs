@@ -1,4 +1,4 @@
-//! Paths, videos, and what is saved beside frames.
+//! Paths, videos, and layers saved beside frames.
 
 use super::SMALL;
 use super::{Place, SIZE, complained, complained_of, png};
@@ -9,7 +9,7 @@ use raygrad_scenes::ANGLE_X;
 use serde_json::{Value, json};
 use std::process::{Command, Stdio};
 
-/// The greatest difference between two images of one size, in steps of 8 bits.
+/// The largest difference of two images of one size, in steps of 8 bits.
 #[track_caller]
 fn apart(a: &Image, b: &Image) -> f32 {
     assert_eq!([a.width, a.height, a.channels], [b.width, b.height, b.channels]);
@@ -24,17 +24,17 @@ fn paths_follow_images_and_files() {
     place.succeeds("render run --path test --out test");
     let test = [0, 1, 2].map(|i| png(&place.path(&format!("test/000{i}.png"))));
     assert!(apart(&test[0], &test[1]) > 3.0 && apart(&test[1], &test[2]) > 3.0);
-    // A spline passes its photographs, by number and by name.
+    // A spline passes its images, given by number or by name.
     for (out, through) in [("numbers", "2,0"), ("names", "test/r_2,test/r_0")] {
         place.succeeds(&format!("render run --path spline --keyframes {through} --split test --frames 3 --out {out}"));
         let spline = [0, 1, 2].map(|i| png(&place.path(&format!("{out}/000{i}.png"))));
         assert!(apart(&spline[0], &test[2]) <= 1.0 && apart(&spline[2], &test[0]) <= 1.0);
         assert!(apart(&spline[1], &test[0]) > 3.0 && apart(&spline[1], &test[2]) > 3.0);
     }
-    // A closed one is on its way back where an open one has arrived.
+    // A closed path returns where an open one ends.
     place.succeeds("render run --path spline --keyframes 2,0 --split test --closed --frames 4 --out closed");
     assert!(apart(&png(&place.path("closed/0002.png")), &test[0]) <= 1.0);
-    // The cameras of a file are in the capture's coordinates.
+    // The cameras of a file are in capture coordinates.
     let transforms = place.transforms(Split::Test);
     let shot = |i: usize| {
         let rows = transforms["frames"][i]["transform_matrix"].as_array().unwrap().clone();
@@ -54,7 +54,7 @@ fn paths_follow_images_and_files() {
     let gif = place.bytes("half.gif");
     let mut decoder = gif::Decoder::new(&gif[..]).unwrap();
     assert_eq!(decoder.read_next_frame().unwrap().unwrap().delay, 5, "20 frames a second, as the file says");
-    // Others see other things.
+    // Other path types show other views.
     place.succeeds("render run --path spiral --frames 3 --aspect 3:2 --radius 3 --out spiral");
     let spiral = [0, 1].map(|i| png(&place.path(&format!("spiral/000{i}.png"))));
     assert!([spiral[0].width, spiral[0].height] == [36, 24] && apart(&spiral[0], &spiral[1]) > 3.0);
@@ -67,7 +67,7 @@ fn paths_follow_images_and_files() {
     {
         assert!(apart(&one(flags), &usual) > 3.0, "{flags}");
     }
-    // At twice the tangent of half of the angle, what was seen is in the middle, at half the size.
+    // At twice the tangent of half the field of view, the former image is in the middle at half the size.
     let wide = one("--size 48x48 --fov 71.507778");
     let middle = |x: usize, y: usize| wide.pixel(12 + x, 12 + y).to_vec();
     let worst = (0..SIZE * SIZE).map(|i| {
@@ -77,9 +77,9 @@ fn paths_follow_images_and_files() {
     assert!(255.0 * worst.fold(0.0_f32, raygrad::Real::maximum) <= 2.0);
 }
 
-/// In a scene that lies elsewhere than its capture.
+/// A scene whose coordinates differ from those of its capture.
 #[test]
-fn paths_lie_where_the_scene_does() {
+fn paths_follow_the_scene_transform() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 30 --out run --scene-type unbounded {SMALL}"));
     let config = place.json("run/config.json");
@@ -102,7 +102,7 @@ fn paths_lie_where_the_scene_does() {
     std::fs::write(place.path("path.json"), path.to_string()).unwrap();
     place.succeeds("render run --path path.json --out path");
     assert!(apart(&png(&place.path("path/0000.png")), &expected) <= 1.0);
-    // One that says so itself needs no word about it.
+    // A file that names its transform needs no warning.
     let said = |path: &Value, flags: &str| {
         std::fs::write(place.path("path.json"), path.to_string()).unwrap();
         let output = place.command(&format!("render run --path path.json {flags} --out said")).output().unwrap();
@@ -126,7 +126,7 @@ fn paths_lie_where_the_scene_does() {
     let (code, words) = said(&own, "");
     assert!(code == Some(1) && words.contains("path.json") && words.contains("`scene`, expected `capture`"), "{words}");
 
-    // In nerfstudio's own coordinates, of a file whose coordinates are not those of before either.
+    // nerfstudio's own coordinates, for a file with another transform.
     place.succeeds("prepare scene --to nerfstudio --out captured");
     let mut transforms = place.json("captured/transforms.json");
     let before = DAffine3::from_cols_array(&[1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0, 0.5, 0.2, -0.3]);
@@ -153,9 +153,9 @@ fn paths_lie_where_the_scene_does() {
     assert!(apart(&png(&place.path("moved/0000.png")), &expected) <= 1.0);
 }
 
-/// At the size that photographs were read in, whose sides may have been rounded apart: 28 x 21 to 14 x 11.
+/// At the size of the training images, whose sides were rounded separately: 28 x 21 to 14 x 11.
 #[test]
-fn test_views_are_seen_as_they_are_compared() {
+fn test_views_render_as_in_eval() {
     let place = Place::empty();
     place.succeeds("prepare landscape --to nerfstudio --size 28 --out scene");
     place.succeeds(&format!("train scene --downscale 2 --steps 20 --out run {SMALL}"));
@@ -163,7 +163,7 @@ fn test_views_are_seen_as_they_are_compared() {
     place.succeeds("render run --path test --frames 1 --out test");
     let [seen, drawing] = ["test/0000.png", "run/eval-test-fast-1/000.png"].map(|file| png(&place.path(file)));
     assert_eq!([seen.width, seen.height, drawing.width, drawing.height], [14, 11, 4 * 14, 11]);
-    // Photograph, render, error and depth stand side by side.
+    // Ground truth, render, error and depth are side by side.
     for (x, y) in (0..14).flat_map(|x| (0..11).map(move |y| (x, y))) {
         let apart = seen.pixel(x, y).iter().zip(drawing.pixel(14 + x, y)).map(|(a, b)| (a - b).abs());
         assert!(255.0 * apart.fold(0.0, raygrad::Real::maximum) <= 1.0, "{x} {y}");
@@ -171,7 +171,7 @@ fn test_views_are_seen_as_they_are_compared() {
 }
 
 #[test]
-fn flags_that_do_not_fit_are_named() {
+fn conflicting_flags_are_named() {
     let place = Place::with_run();
     for (flags, expected) in [
         ("--path test --radius 2", "`radius`: does not apply to --path test: it is for orbit and spiral"),
@@ -220,7 +220,7 @@ fn flags_that_do_not_fit_are_named() {
     }
     let left: Vec<_> = std::fs::read_dir(place.path("run")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert!(!left.iter().any(|name| name == "orbit"), "{left:?}");
-    // A folder that is there may be called what it likes; key frames of a file make as many frames as it says how fast they are.
+    // An existing folder may have any name. Keyframes of a file give the number of frames by its speed.
     std::fs::create_dir(place.path("clip.mov")).unwrap();
     place.succeeds("render run --frames 1 --out clip.mov");
     let key = |x: f64| json!({ "matrix": [1, 0, 0, x, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1], "fov": 50 });
@@ -234,7 +234,7 @@ fn flags_that_do_not_fit_are_named() {
 }
 
 #[test]
-fn what_is_saved_beside_frames_belongs_to_them() {
+fn saved_layers_belong_to_their_frames() {
     let place = Place::empty();
     place.succeeds(&format!("train --downscale 5 --steps 150 --out run {SMALL}"));
     let save = "--save depth,depth-npy,normals,opacity,alpha --depth-unit 0.01";
@@ -274,14 +274,14 @@ fn what_is_saved_beside_frames_belongs_to_them() {
         assert!(solid > 20, "{solid} pixels of {frame} are solid");
     }
     assert!(!place.path("frames/unfinished.json").exists());
-    // What is too far for 16 bits is said.
+    // A warning counts the depths beyond 16 bits.
     let output = place.command("render run --frames 1 --save depth --depth-unit 1e-6 --out fine").output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success() && said.contains("or --save depth-npy"), "{said}");
 }
 
-/// The depth of each pixel along the optical axis is that along the ray times a cosine, whatever the lens; here for the
-/// reader's own convention, from outside.
+/// The depth of each pixel is the distance along the ray times a cosine, for any lens. The test uses another
+/// implementation of the reader's convention.
 #[test]
 fn depths_are_along_the_axis() {
     let camera = Camera::from_angle(3, 1, 2.0 * 2.0_f64.atan(), DAffine3::IDENTITY);
@@ -289,7 +289,8 @@ fn depths_are_along_the_axis() {
     let npy = Depths::new(&distances, &camera, 10.0).to_npy();
     let depths: Vec<f32> =
         npy[npy.len() - 12..].chunks_exact(4).map(|x| f32::from_le_bytes(x.try_into().unwrap())).collect();
-    // Half a width of 1.5 pixels is two focal lengths: the outer pixel's centre lies 4/3 of one aside, at a cosine of 3/5.
+    // Half a width of 1.5 pixels is two focal lengths: the outer pixel centre is 4/3 focal lengths aside, with a cosine
+    // of 3/5.
     for (found, expected) in depths.iter().zip([12.0, 20.0, 12.0]) {
         assert!((found - expected).abs() < 1e-5, "{depths:?}");
     }
@@ -321,14 +322,14 @@ fn videos_hold_the_frames_at_their_speed() {
         let expected: Vec<u8> = frame.data.iter().map(|x| (255.0 * x).round() as u8).collect();
         assert!(bytes == expected, "not a color is lost");
     }
-    // Frames are gone with the video, unless they are to stay.
+    // The frames are removed after the video, except with `--keep-frames`.
     assert!(!place.path("video.gif.frames").exists() && !place.path("video.apng.frames").exists());
     place.succeeds("render run --frames 3 --size 21x13 --out video.gif --keep-frames --overwrite");
     assert_eq!(png(&place.path("video.gif.frames/0002.png")), frames[2]);
     assert!(!place.path("video.gif.frames/unfinished.json").exists());
 }
 
-/// Whether ffmpeg is there; says so if not.
+/// Returns true if ffmpeg is installed; prints a skip message otherwise.
 pub fn has_ffmpeg() -> bool {
     let found = Command::new("ffmpeg").arg("-version").stdout(Stdio::null()).status().is_ok();
     if !found {
@@ -343,7 +344,7 @@ fn ffmpeg_videos_have_the_frames_colours() {
         return;
     }
     let place = Place::with_run();
-    // A folder whose name looks like a number of frames.
+    // A folder whose name contains a number format.
     std::fs::create_dir(place.path("a%03d b")).unwrap();
     for video in ["video.mp4", "video.webm"] {
         let video = format!("a%03d b/{video}");
@@ -369,10 +370,10 @@ fn ffmpeg_videos_have_the_frames_colours() {
         assert!(taken.unwrap().success());
         let (seen, frame) = (png(&first), png(&place.path(&format!("{video}.frames/0003.png"))));
         assert_eq!([seen.width, seen.height], [64, 42]);
-        // Colors have half the resolution, brightness has all of it.
+        // Chroma has half the resolution, and luma the full one.
         let bright = |x: usize| seen.pixel(x, 5).iter().zip([0.2126, 0.7152, 0.0722]).map(|(x, w)| x * w).sum::<f32>();
         assert!(bright(63) < 0.6 * bright(62), "black is at the right: {} {}", bright(63), bright(62));
-        // In a corner there is nothing but background, which no chroma of others comes into.
+        // A corner shows only background, without chroma of other parts.
         let [corner, expected] = [seen.pixel(3, 3), frame.pixel(3, 3)];
         let worst = corner.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, raygrad::Real::maximum);
         assert!(255.0 * worst <= 6.0, "{video}: {corner:?} {expected:?}");
@@ -414,7 +415,7 @@ fn ffmpeg_errors_and_missing_encoders_are_shown() {
                     .apng, which need no ffmpeg";
     complained_of("no encoder", &output, expected);
     assert!(!place.path("video.mp4.frames").exists());
-    // It fails after it has said what is wrong and reported its progress for long.
+    // The script fails after an error message and a long progress report.
     let output = with(
         "case $* in *-encoders*) echo ' V..... libx264 H.264';; *) echo 'the disk is full' >&2; sleep 0.3
          i=0; while [ $i -lt 20 ]; do echo frame=$i; i=$((i+1)); done; exit 3;; esac",
@@ -425,7 +426,7 @@ fn ffmpeg_errors_and_missing_encoders_are_shown() {
 
 #[cfg(unix)]
 #[test]
-fn an_interrupted_video_goes_on_where_it_was() {
+fn interrupted_video_resumes() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 3 {SMALL}"));
     let arguments = "render run --frames 100 --size 24x20 --out video.apng";
@@ -439,7 +440,7 @@ fn an_interrupted_video_goes_on_where_it_was() {
     assert!(said.contains("of 100 frames, in video.apng.frames: run the same command to resume"), "{said}");
     let done = place.json("video.apng.frames/unfinished.json")["done"].as_u64().unwrap() as usize;
     assert!(done >= 3 && frame(done - 1).exists() && !frame(done).exists() && !place.path("video.apng").exists());
-    // Frames that are there are not rendered again: a mark on one stays.
+    // Existing frames are not rendered again: a mark on one stays.
     let mark = Image { width: 24, height: 20, channels: 3, data: vec![0.2; 3 * 24 * 20] };
     mark.save_png(frame(1)).unwrap();
     let output = place.command(arguments).output().unwrap();
@@ -448,11 +449,11 @@ fn an_interrupted_video_goes_on_where_it_was() {
     assert!(said.contains(&format!("resuming after {done} of 100 frames")), "{said}");
     let frames = decoded(&place.path("video.apng"));
     assert!(frames.len() == 100 && frames[1].iter().all(|x| *x == 51) && !place.path("video.apng.frames").exists());
-    // Others than those that were there are as in a video that was not interrupted.
+    // The other frames equal those of an uninterrupted video.
     place.succeeds("render run --frames 100 --size 24x20 --out whole.apng");
     let whole = decoded(&place.path("whole.apng"));
     assert!((0..100).all(|i| (whole[i] == frames[i]) == (i != 1)));
-    // What would show something else begins again, where it may.
+    // A different video starts again, if it may overwrite.
     place.succeeds("render run --frames 2 --size 12x10 --out video.gif --keep-frames");
     let video = "render run --frames 4000 --size 24x20 --out video.gif";
     place.fails(video, &["video.gif: exists, and another command or other options made it"]);
@@ -465,7 +466,7 @@ fn an_interrupted_video_goes_on_where_it_was() {
         std::fs::write(place.path("video.gif.frames/unfinished.json"), record.to_string()).unwrap();
     };
     let begun = |flags: &str| {
-        // When it is there again, it is this call's.
+        // The folder belongs to this call after it was replaced.
         let _ = std::fs::remove_file(place.path("video.gif.frames/0003.png"));
         let mut child = place.command(&format!("{video} {flags}"));
         let mut child = child.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
@@ -488,13 +489,13 @@ fn an_interrupted_video_goes_on_where_it_was() {
             "{said}"
         );
     }
-    // Another model, of which the same is asked.
+    // The same command with another model.
     begun("--overwrite");
     kept(3);
     place.succeeds("train --resume run --steps 4");
     let said = begun("");
     assert!(said.contains("that were rendered with another config, model"), "{said}");
-    // One at a time.
+    // Only one at a time.
     let mut child = place.command("render run --frames 400 --size 36x30 --out slow.gif").stdout(Stdio::null()).spawn();
     let child = child.as_mut().unwrap();
     super::wait(child, || place.path("slow.gif.frames/0000.png").exists());

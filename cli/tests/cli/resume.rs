@@ -1,4 +1,4 @@
-//! Runs that end before their time, and go on.
+//! Interrupted runs, and resuming them.
 
 use super::{Place, SMALL};
 use serde_json::Value;
@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// What each line of a run's metrics says but for times, which differ.
+/// The lines of a run's metrics without times.
 fn metrics(place: &Place, run: &str) -> Vec<Value> {
     let text = String::from_utf8(place.bytes(&format!("{run}/metrics.jsonl"))).unwrap();
     let line = |line: &str| {
@@ -18,7 +18,7 @@ fn metrics(place: &Place, run: &str) -> Vec<Value> {
     text.lines().map(line).collect()
 }
 
-/// The steps of a run's checkpoints, the earliest first.
+/// The checkpoints of a run, the earliest first.
 fn checkpoints(place: &Place, run: &str) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(place.path(&format!("{run}/checkpoints"))).unwrap();
     let mut found: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
@@ -32,9 +32,9 @@ pub fn assert_same(place: &Place, a: &str, b: &str) {
     assert_eq!(metrics(place, a), metrics(place, b));
 }
 
-/// `KILLS=50 cargo test --release --test cli killed` is the campaign.
+/// `KILLS=50 cargo test --release --test cli killed` kills a run 50 times.
 #[test]
-fn killed_run_ends_as_if_it_had_not_been() {
+fn killed_run_ends_as_if_undisturbed() {
     let kills: u32 = std::env::var("KILLS").map_or(4, |kills| kills.parse().unwrap());
     let place = Place::with_scene();
     let steps = 30 * kills.max(4);
@@ -45,7 +45,7 @@ fn killed_run_ends_as_if_it_had_not_been() {
     let mut arguments = format!("train scene --steps {steps} --out run --checkpoint-every 0.02s {SMALL}");
     loop {
         let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        // Somewhere in the time that is left of it, by the golden ratio; at last it is let be.
+        // At a varying point of the remaining time, by the golden ratio. The last run is not killed.
         let share = (f64::from(killed) * 0.618).fract();
         let until = Instant::now() + whole.mul_f64(0.1 + 0.9 * share) / kills.max(4) * 2;
         while child.try_wait().unwrap().is_none() && (killed >= kills || Instant::now() < until) {
@@ -76,7 +76,7 @@ fn interrupted_run_names_resume_and_can_be_extended() {
     place.succeeds(&format!("train scene --steps 200 --out whole {SMALL}"));
     let arguments = format!("train scene --steps 200 --out run {SMALL}");
     let mut child = place.command(&arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
-    // Two lines: it has begun, and makes steps.
+    // Two lines: training has begun and makes steps.
     let lines = || std::fs::read(place.path("run/metrics.jsonl")).map_or(0, |text| text.split(|b| *b == b'\n').count());
     super::wait(&mut child, || lines() > 2);
     Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
@@ -89,7 +89,7 @@ fn interrupted_run_names_resume_and_can_be_extended() {
         assert!(said.contains("resumed  at step ") && !said.contains("resumed  at step 0\n"), "{said}");
     }
     assert_same(&place, "whole", "run");
-    // That it is at its end is no error.
+    // Resuming a finished run is not an error.
     place.succeeds("train --resume run");
     assert_same(&place, "whole", "run");
     let kept = |place: &Place| place.json("run/config.json")["keep_checkpoints"].clone();
@@ -100,7 +100,7 @@ fn interrupted_run_names_resume_and_can_be_extended() {
     assert_eq!(metrics(&place, "run").last().unwrap()["step"], 220);
     assert_eq!(metrics(&place, "run")[..21], metrics(&place, "whole")[..]);
     assert_eq!(place.json("run/config.json")["budget"]["steps"], 220);
-    // As many stay from then on; none at all would leave nothing to go on from.
+    // The number stays from then on. At least two checkpoints must stay.
     place.succeeds("train --resume run --steps 221");
     assert_eq!((kept(&place), checkpoints(&place, "run").len()), (3.into(), 3));
     for (number, goes) in [(2, true), (16384, true), (0, false), (1, false), (16385, false)] {
@@ -115,7 +115,7 @@ fn interrupted_run_names_resume_and_can_be_extended() {
 }
 
 #[test]
-fn what_is_damaged_leaves_the_checkpoint_before_it() {
+fn damaged_checkpoint_falls_back_to_the_previous() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 30 --out whole {SMALL}"));
     place.succeeds(&format!("train scene --steps 30 --out run --checkpoint-every 0.001s {SMALL}"));
@@ -132,14 +132,14 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
     assert!(String::from_utf8(output.stdout).unwrap().contains("resumed  at step 29\n"));
     assert_same(&place, "whole", "run");
     assert!(!place.path("run/checkpoints/.tmp123").exists());
-    // One that is there and cannot be read is not passed over: it may be whole.
+    // An unreadable checkpoint is not skipped: it may be valid.
     std::fs::create_dir(place.path("run/checkpoints/00000089.checkpoint")).unwrap();
     place.fails(
         "train --resume run",
         &["00000089.checkpoint: cannot be read", "delete it to resume from the checkpoint before it"],
     );
     std::fs::remove_dir(place.path("run/checkpoints/00000089.checkpoint")).unwrap();
-    // A damaged one that says that it is later is not kept in place of one that is whole.
+    // A damaged later checkpoint does not displace a valid one.
     std::fs::write(place.path("run/checkpoints/00000090.checkpoint"), b"").unwrap();
     let output = place.command("train --resume run --steps 31").output().unwrap();
     assert!(output.status.success() && String::from_utf8(output.stdout).unwrap().contains("resumed  at step 30\n"));
@@ -149,7 +149,7 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
     );
     place.succeeds("train --resume run --steps 32");
     let [before, last] = checkpoints(&place, "run").try_into().unwrap();
-    // What is not whole in the metrics is written again.
+    // Incomplete metrics lines are rewritten.
     let mut text = place.bytes("run/metrics.jsonl");
     text.truncate(text.len() - 5);
     std::fs::write(place.path("run/metrics.jsonl"), text).unwrap();
@@ -168,14 +168,14 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
     );
     assert_eq!(message.matches("its checksum does not match").count(), 2, "{message}");
     assert!(place.bytes("run/model.safetensors") == model, "nothing is lost");
-    // What earlier versions have trained is not begun again.
+    // Runs of earlier versions are not started again.
     std::fs::remove_dir_all(place.path("run/checkpoints")).unwrap();
     place.fails_with(
         "train --resume run",
         "run: has no checkpoints, like runs of earlier versions, and cannot resume: train a new run",
     );
     assert!(place.bytes("run/model.safetensors") == model);
-    // What was killed before its first step is.
+    // A run that was killed before its first step starts again.
     std::fs::remove_file(place.path("run/metrics.jsonl")).unwrap();
     assert!(place.succeeds("train --resume run").contains("resumed  at step 0\n"));
     place.succeeds(&format!("train scene --steps 32 --out other {SMALL}"));
@@ -191,9 +191,9 @@ fn write_failures_do_not_end_a_run() {
         let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         let begun = || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0);
         super::wait(&mut child, begun);
-        // Again and again, as it makes it anew for each checkpoint.
+        // Repeatedly, since the program recreates it for each checkpoint.
         while std::fs::remove_dir_all(place.path("run")).is_err() {}
-        // A busy machine may have let it end before.
+        // On a busy machine training may have ended before.
         let ended = child.try_wait().unwrap().is_some();
         let output = child.wait_with_output().unwrap();
         (!ended || !output.status.success()).then_some(output)
@@ -207,7 +207,7 @@ fn write_failures_do_not_end_a_run() {
 }
 
 #[test]
-fn a_run_goes_on_alone_and_with_its_own_photographs() {
+fn resume_needs_the_lock_and_the_training_images() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 2 --out run --near 2.5 {SMALL}"));
     let lock = File::options().write(true).open(place.path("run/lock")).unwrap();
@@ -216,7 +216,7 @@ fn a_run_goes_on_alone_and_with_its_own_photographs() {
     drop(lock);
     place.succeeds("train --resume run --steps 4");
     assert_eq!(place.json("run/config.json")["scene_box"]["near_far"][0], 2.5);
-    // A folder in which nothing was finished is as good as none.
+    // A folder without a finished file may become a run.
     std::fs::create_dir(place.path("begun")).unwrap();
     std::fs::write(place.path("begun/.tmpx1"), b"{").unwrap();
     place.succeeds(&format!("train scene --steps 1 --out begun {SMALL}"));
@@ -234,7 +234,7 @@ fn a_run_goes_on_alone_and_with_its_own_photographs() {
     place.fails("train --resume run --steps 5", &["run: ", "other images"]);
 }
 
-/// A run that was ended after 20 steps when checkpoints were new: such files are gone on from for ever.
+/// A run that ended after 20 steps, in the first version with checkpoints. All later versions must resume it.
 #[test]
 fn checkpoint_of_first_version_resumes() {
     let place = Place::empty();
@@ -250,13 +250,13 @@ fn checkpoint_of_first_version_resumes() {
     assert_eq!(after[..before.len()], before, "what was known stays");
     let [first, last] = [&before[0], after.last().unwrap()].map(|line| line["loss"].as_f64().unwrap());
     assert!(last < 0.75 * first && after.last().unwrap()["step"] == 40, "{first} {last}");
-    // It has not begun again: its counts go on.
+    // It did not start again: its counts continue.
     assert!(after.last().unwrap()["rays"].as_f64().unwrap() > 1.5 * before.last().unwrap()["rays"].as_f64().unwrap());
-    // What a later raygrad wrote is not guessed at.
+    // Checkpoints of a later raygrad are errors.
     let path = place.path("run/checkpoints/00000040.checkpoint");
     let bytes = std::fs::read(&path).unwrap();
     std::fs::write(&path, [b"raygrad checkpoint 2", &bytes[20..]].concat()).unwrap();
-    // Nor passed over, though the one before it is whole.
+    // Nor is it skipped for the earlier valid one.
     assert!(place.path("run/checkpoints/00000020.checkpoint").exists());
     let (succeeds, said) = complaints(&place, "train --resume run --steps 50");
     assert!(
@@ -271,7 +271,7 @@ fn checkpoint_of_first_version_resumes() {
     place.fails("eval run", &["run/config.json: raygrad 99.0.0 wrote it", "use 99.0.0 or newer"]);
 }
 
-/// The words of a run on standard error, and whether it succeeded.
+/// The standard error of a run, and whether it succeeded.
 fn complaints(place: &Place, arguments: &str) -> (bool, String) {
     let output = place.command(arguments).output().unwrap();
     assert!(output.status.success() || output.status.code() == Some(1), "{output:?}");
@@ -288,17 +288,17 @@ fn diverged_run_returns_at_a_lower_lr() {
     assert!(succeeds && said.contains("recorded at nerf/src/field/instant.rs:"), "{said}");
     let retreats = said.matches("resuming from step 0 with 0.25 times the learning rate").count() as i32;
     assert!((1..=3).contains(&retreats) && !said.contains("training diverged: "), "{said}");
-    // Each time TensorBoard is told to forget what was.
+    // Each retreat starts an event file, which makes TensorBoard drop the later steps.
     let events = std::fs::read_dir(place.path("run/tensorboard")).unwrap().count() as i32;
     assert!(events == retreats + 1 && place.json("run/summary.json")["retreats"] == retreats, "{events}");
-    // Each begins with a version and with the first step that it is of: a time and, in a byte, the number 1.
+    // Each begins with a version record, then one with its first step: a time and, in one byte, the number 1.
     for file in std::fs::read_dir(place.path("run/tensorboard")).unwrap() {
         let bytes = std::fs::read(file.unwrap().path()).unwrap();
         let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
         let start = &bytes[length + 16..][12..];
         assert_eq!([start[0], start[9], start[10]], [0x09, 0x10, 1], "{:x?}", &start[..11]);
     }
-    // The metrics are those of one run, all of it at the last rate.
+    // The metrics are those of a single run at the last learning rate.
     let metrics = metrics(&place, "run");
     let steps: Vec<u64> = metrics.iter().map(|line| line["step"].as_u64().unwrap()).collect();
     assert_eq!(steps, [1, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100, 110, 120]);
@@ -310,7 +310,7 @@ fn diverged_run_returns_at_a_lower_lr() {
         let rate = (done / warmup).min(1.0) * (from + (to - from) * done) * 0.25_f64.powi(retreats);
         assert!((line["lr"].as_f64().unwrap() - rate).abs() <= 1e-9 * rate, "{line}: {rate}");
     }
-    // Going on with it, the rate stays as low.
+    // Resuming keeps the lower learning rate.
     let rate = metrics.last().unwrap()["lr"].as_f64().unwrap();
     place.succeeds("train --resume run --steps 121");
     let last = self::metrics(&place, "run").pop().unwrap();
@@ -320,7 +320,7 @@ fn diverged_run_returns_at_a_lower_lr() {
 #[test]
 fn run_diverging_again_ends_with_last_good_model() {
     let place = Place::empty();
-    // It learns, until its rate leaves all bounds.
+    // It learns until the learning rate is too large.
     let schedule = r#"{"exponential":{"from":0.0001,"to":1e30,"warmup":0.0}}"#;
     let rates = format!("--set schedule={schedule} --checkpoint-every 0.02s");
     let output =
@@ -335,9 +335,9 @@ fn run_diverging_again_ends_with_last_good_model() {
         end.split("the saved model is from step ").nth(1).unwrap().split(';').next().unwrap().parse().unwrap();
     let kept = checkpoints(&place, "run");
     assert!(step > 0 && kept.last().unwrap().ends_with(format!("{step:08}.checkpoint")), "{step} {kept:?}");
-    // Nothing speaks of later steps.
+    // No metrics of later steps remain.
     assert!(metrics(&place, "run").iter().all(|line| line["step"].as_u64().unwrap() <= step));
-    // It is what was learned until then, and not what overflowed.
+    // The model is the one before the overflow.
     let left = place.bytes("run/model.safetensors");
     place.succeeds(&format!("train --resume run --steps {step}"));
     assert!(place.bytes("run/model.safetensors") == left);

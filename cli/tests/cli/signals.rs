@@ -1,4 +1,4 @@
-//! Signals: what was started to survive a hang-up does, and all else saves its work.
+//! Signals: programs started to survive a hang-up do; all others save their work.
 
 use super::SMALL;
 use super::{Place, wait};
@@ -11,7 +11,7 @@ pub fn send(child: &Child, signal: &str) {
     assert!(sent.success());
 }
 
-/// Does something while a program stands still.
+/// Does something while a program is stopped.
 pub fn stopped<R>(child: &Child, f: impl FnOnce() -> R) -> R {
     send(child, "STOP");
     let result = f();
@@ -19,12 +19,12 @@ pub fn stopped<R>(child: &Child, f: impl FnOnce() -> R) -> R {
     result
 }
 
-/// Whether a file has something in it.
+/// Returns true if a file is not empty.
 fn has_content(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|file| file.len() > 0)
 }
 
-/// Runs `raygrad` by a shell that ignores signals, as `nohup` does.
+/// Runs `raygrad` from a shell that ignores signals, as `nohup` does.
 fn ignoring(place: &Place, signals: &str, arguments: &str) -> Command {
     let mut command = Command::new("/bin/sh");
     command.args(["-c", &format!("trap '' {signals}; exec \"$0\" \"$@\""), env!("CARGO_BIN_EXE_raygrad")]);
@@ -45,10 +45,10 @@ fn ignored_signals_end_no_training() {
         let mut child = ignoring(&place, ignored, &train(run)).spawn().unwrap();
         wait(&mut child, || length(run) > 0);
         ignored.split(' ').for_each(|signal| send(&child, signal));
-        // It makes many more steps.
+        // It takes many more steps.
         let before = length(run);
         wait(&mut child, || length(run) > before + 2000);
-        // It hears other signals.
+        // Other signals end it.
         send(&child, heard);
         assert_eq!(child.wait().unwrap().code(), Some(130), "{ignored}");
         assert_eq!(place.json(&format!("{run}/summary.json"))["ended"], "interrupted");
@@ -56,14 +56,14 @@ fn ignored_signals_end_no_training() {
 }
 
 #[test]
-fn hang_ups_save_the_model_however_often_they_come() {
+fn repeated_hang_ups_save_the_model() {
     let place = Place::with_scene();
     for signal in ["HUP", "TERM"] {
         let mut command = place.command(&format!("train scene --budget 1h --out {signal} {SMALL}"));
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         wait(&mut child, || has_content(&place.path(&format!("{signal}/metrics.jsonl"))));
         let untrained = place.bytes(&format!("{signal}/model.safetensors"));
-        // A terminal that is closed hangs up for itself, and so does the shell in it.
+        // A closed terminal sends a hang-up, and so does its shell.
         let id = child.id().to_string();
         while child.try_wait().unwrap().is_none() {
             let _ = Command::new("kill").args([&format!("-{signal}"), &id]).stderr(Stdio::null()).status();
@@ -76,9 +76,9 @@ fn hang_ups_save_the_model_however_often_they_come() {
 }
 
 #[test]
-fn a_second_ctrl_c_ends_the_program_at_once() {
+fn second_ctrl_c_ends_at_once() {
     let place = Place::with_run();
-    // One picture of it takes minutes.
+    // One image takes minutes.
     let render = "render run --frames 2 --size 6000x6000 --out frames";
     let mut child = place.command(render).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     wait(&mut child, || place.path("frames/unfinished.json").exists());
@@ -92,9 +92,9 @@ fn a_second_ctrl_c_ends_the_program_at_once() {
 }
 
 #[test]
-fn programs_that_are_started_inherit_what_is_ignored() {
+fn child_programs_inherit_ignored_signals() {
     let place = super::prepare::place();
-    // In place of colmap: waits until it is told to go on, and hears of a hang-up meanwhile.
+    // Replaces colmap: waits for a file, and reports a hang-up meanwhile.
     let script = "#!/bin/sh\n[ \"$1\" = mapper ] || exit 0\necho begun $$ >> \"$LOG\"\n\
                   while [ ! -e \"$LOG.go\" ]; do sleep 0.05; done\necho survived >> \"$LOG\"\nexit 1\n";
     let log = place.path("log");
@@ -114,7 +114,7 @@ fn programs_that_are_started_inherit_what_is_ignored() {
             send(&child, "HUP");
         }
         std::fs::write(place.path("log.go"), "").unwrap();
-        // It fails, as this colmap finds nothing; with the code of an interruption it would have removed its work.
+        // It fails, since this colmap finds nothing. After an interruption it would have removed its work.
         assert_eq!(child.wait().unwrap().code(), Some(1));
         assert_eq!(text().contains("survived"), survives, "{signals}: {}", text());
     }

@@ -1,4 +1,4 @@
-//! The page of `raygrad view` and `raygrad train --view`, as another program sees it.
+//! The page of `raygrad view` and `raygrad train --view`, as seen by another client.
 
 use std::collections::VecDeque;
 use std::io::ErrorKind::{TimedOut, WouldBlock};
@@ -19,7 +19,7 @@ use tungstenite::http::Request;
 use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
 
-/// A program that serves a page; it ends with this.
+/// A program that serves a page; it ends when this is dropped.
 pub struct Server {
     pub child: Child,
     pub address: String,
@@ -32,7 +32,7 @@ impl Drop for Server {
     }
 }
 
-/// Starts it, and reads its link.
+/// Starts a server and reads its link.
 pub fn serve(place: &Place, arguments: &str) -> Server {
     serve_with(place.command(arguments).stderr(Stdio::null()))
 }
@@ -45,13 +45,13 @@ fn serve_with(command: &mut Command) -> Server {
         line.clear();
         assert!(out.read_line(&mut line).unwrap() > 0, "it has ended without a link");
     }
-    // What else it prints has a reader.
+    // Drains the rest of its output.
     std::thread::spawn(move || std::io::copy(&mut out, &mut std::io::sink()));
     let address = line.split("http://").nth(1).unwrap().trim().trim_end_matches('/').to_owned();
     Server { child, address }
 }
 
-/// What a request by hand is answered: status, head and body.
+/// Sends a plain request and returns status, head and body.
 fn request(address: &str, head: &str) -> (u16, String, String) {
     let mut stream = TcpStream::connect(address).unwrap();
     stream.write_all(format!("{head}\r\nConnection: close\r\n\r\n").as_bytes()).unwrap();
@@ -62,13 +62,13 @@ fn request(address: &str, head: &str) -> (u16, String, String) {
     (head.split(' ').nth(1).unwrap().parse().unwrap(), head.to_lowercase(), body.to_owned())
 }
 
-/// A page without a browser.
+/// A client without a browser.
 struct Page {
     socket: WebSocket<MaybeTlsStream<TcpStream>>,
-    /// What came and was not asked for yet.
+    /// Received messages that were not used yet.
     texts: VecDeque<Value>,
     files: VecDeque<(Value, Vec<u8>)>,
-    /// When something was said or opened last: an answer does not take for ever.
+    /// The time of the last request, to limit the wait for an answer.
     said: Instant,
 }
 
@@ -98,7 +98,7 @@ impl Page {
         }
     }
 
-    /// What comes within so long, without waiting for more.
+    /// Receives messages for this long.
     fn hear(&mut self, within: Duration) {
         let start = Instant::now();
         self.patience(Duration::from_millis(20));
@@ -108,14 +108,14 @@ impl Page {
         self.patience(Duration::from_secs(60));
     }
 
-    /// Whether no picture comes within so long.
+    /// Returns true if no image arrives within this time.
     fn is_quiet(&mut self, within: Duration) -> bool {
         self.files.clear();
         self.hear(within);
         self.files.is_empty()
     }
 
-    /// Reads one message; says why it was closed if it was.
+    /// Reads one message; returns the reason if the connection was closed.
     fn read(&mut self) -> Result<(), String> {
         assert!(self.said.elapsed() < Duration::from_secs(300), "no answer");
         match self.socket.read() {
@@ -136,7 +136,7 @@ impl Page {
         Ok(())
     }
 
-    /// How training has ended.
+    /// Waits for the end of training and returns its message.
     fn ended(&mut self) -> Value {
         loop {
             self.said = Instant::now();
@@ -169,7 +169,7 @@ impl Page {
         }
     }
 
-    /// The pictures of a view from coarse to whole, and what was said of them.
+    /// The images of a view from coarse to complete, with their messages.
     fn look(&mut self, id: u32, view: &Value) -> Vec<(Value, Image)> {
         self.say(json!({ "ask": "view", "id": id, "view": view }));
         let mut pictures = vec![];
@@ -185,7 +185,7 @@ impl Page {
         }
     }
 
-    /// Why the program ends the connection, which it must.
+    /// The reason why the program closes the connection, which it must.
     #[track_caller]
     fn closed(&mut self) -> String {
         let start = Instant::now();
@@ -210,7 +210,7 @@ fn decoded(bytes: &[u8]) -> Image {
     png(&path)
 }
 
-/// What pages are told of the cameras of a run's test views.
+/// The cameras of a run's test views as pages receive them.
 pub fn test_cameras(place: &Place, run: &str) -> Vec<Value> {
     let server = serve(place, &format!("view {run}"));
     let about = Page::open(&server.address).1;
@@ -218,7 +218,7 @@ pub fn test_cameras(place: &Place, run: &str) -> Vec<Value> {
     photographs.iter().filter(|photograph| photograph["split"] == "test").cloned().collect()
 }
 
-/// With a run that pictures are quick of.
+/// A place with a run that renders quickly.
 fn trained() -> Place {
     static TRAINED: LazyLock<Kept> = LazyLock::new(|| {
         let place = Place::with_scene();
@@ -228,13 +228,13 @@ fn trained() -> Place {
     TRAINED.place()
 }
 
-/// From where the scene is seen at first.
+/// The initial view of the scene.
 fn first(about: &Value, size: [usize; 2]) -> Value {
     json!({ "eye": { "free": { "pose": about["pose"], "fov": about["fov"] } }, "size": size })
 }
 
 #[test]
-fn what_a_page_shows_is_what_the_program_renders() {
+fn page_image_equals_render() {
     let place = trained();
     place.succeeds("render run --frames 1 --size 96x96 --out seen");
     let expected = png(&place.path("seen/0000.png"));
@@ -252,11 +252,11 @@ fn what_a_page_shows_is_what_the_program_renders() {
     let (head, whole) = pictures.last().unwrap();
     assert!(psnr(whole, &expected) > 40.0, "{}", psnr(whole, &expected));
     assert!(head["compared"].is_null());
-    // Coarse pictures are of the same, each half as large as the next.
+    // Coarse images show the same; each has half the size of the next.
     for pair in pictures.windows(2) {
         assert_eq!(pair[0].1.width, pair[1].1.width.div_ceil(2));
     }
-    // Nobody else has to wait for what was painted.
+    // Another client gets the rendered image at once.
     let (mut other, _) = Page::open(&server.address);
     assert_eq!(other.look(1, &view)[0].1, *whole);
     let shows = ["depth", "normals", "opacity"].map(|show| {
@@ -270,24 +270,24 @@ fn what_a_page_shows_is_what_the_program_renders() {
         } else {
             expected
         };
-        // Colours of a model of few steps jump from pixel to pixel, which JPEG does not like.
+        // After few steps, colours vary from pixel to pixel, which JPEG compresses badly.
         assert!(psnr(&seen, &expected) > 30.0, "{show}: {}", psnr(&seen, &expected));
         seen
     });
     assert!(shows[0] != shows[1] && shows[1] != shows[2]);
-    // A box, a background.
+    // A crop box and a background.
     let mut cropped = view.clone();
     cropped["crop"] = json!([[50.0, 50.0, 50.0], [51.0, 51.0, 51.0]]);
     cropped["background"] = json!([0, 0, 255]);
     let nothing = page.look(9, &cropped).pop().unwrap().1;
     assert!(nothing.data.chunks(3).all(|pixel| pixel[2] > 0.97 && pixel[0] < 0.03), "blue");
-    // What is kept is exact.
+    // Saved images are exact.
     page.say(json!({ "ask": "save", "view": view }));
     let (head, bytes) = page.file("save");
     assert_eq!(head["name"], "view.png");
-    // Rays that are rendered beside others end a sample sooner or later.
+    // Tiles may end a ray a sample earlier or later.
     assert!(psnr(&decoded(&bytes), &expected) > 50.0);
-    // Many are kept one after the other, and what is too many is said.
+    // Several are saved one after the other; too many are refused with a message.
     for _ in 0..12 {
         page.say(json!({ "ask": "save", "view": view }));
     }
@@ -300,18 +300,18 @@ fn image_is_rendered_once_and_none_for_hidden_pages() {
     let place = Place::with_scene();
     let server = serve(&place, &format!("--threads 1 train scene --steps 1000000 --view --out run {SMALL}"));
     let (mut page, about) = Page::open(&server.address);
-    // While it learns it is painted again, never as fine as would take long.
+    // During training the view is rendered again, but not at a slow resolution.
     page.say(json!({ "ask": "view", "id": 1, "view": first(&about, [900, 900]) }));
     let shots: Vec<Value> = (0..4).map(|_| page.file("picture").0).collect();
     assert!(shots.iter().all(|head| head["halvings"] != 0), "{shots:?}");
     assert!(shots[3]["step"].as_u64().unwrap() > shots[0]["step"].as_u64().unwrap(), "{shots:?}");
-    // What is quick is not painted at every step either, but twice a second.
+    // Quick views are rendered twice a second, not at every step.
     page.look(5, &first(&about, [24, 24]));
     page.files.clear();
     page.texts.clear();
     page.hear(Duration::from_millis(1600));
     assert!((1..=4).contains(&page.files.len()), "{}", page.files.len());
-    // Nor is it told at every step how it goes.
+    // Progress is not sent at every step either.
     assert!((1..=5).contains(&page.texts.len()), "{}", page.texts.len());
     let told = page.text("training");
     assert!(told["psnr"].as_f64().unwrap() > 5.0 && told["loss"].as_f64().unwrap() < 1.0, "{told}");
@@ -319,26 +319,26 @@ fn image_is_rendered_once_and_none_for_hidden_pages() {
     page.say(json!({ "ask": "rest" }));
     page.hear(Duration::from_millis(500));
     assert!(page.is_quiet(Duration::from_millis(1200)));
-    // Checkpoints are for later.
+    // Checkpoints are available after training.
     let mut view = first(&about, [8, 8]);
     view["checkpoint"] = json!(0);
     page.say(json!({ "ask": "view", "id": 2, "view": view }));
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("only after training"));
-    // Held, it is painted as fine as it goes, once.
+    // While paused, the view is rendered once at full resolution.
     page.say(json!({ "ask": "view", "id": 6, "view": first(&about, [300, 300]) }));
     page.hear(Duration::from_millis(500));
     let is_whole = |head: &Value| head["halvings"] == 0;
     let went = page.files.drain(..).any(|(head, _)| is_whole(&head));
     page.say(json!({ "ask": "pause", "pause": true }));
-    // What is quick enough is whole while it learns, too.
+    // Quick views are complete during training too.
     while !went && !is_whole(&page.file("picture").0) {}
     page.look(3, &first(&about, [64, 64]));
     assert!(page.is_quiet(Duration::from_millis(1200)));
 }
 
-/// A scene that is no square, has no end and lies turned in its coordinates.
+/// A scene that is not cubic, is unbounded and is rotated in its coordinates.
 #[test]
-fn captures_keep_their_proportions_and_their_places() {
+fn captures_keep_proportions_and_positions() {
     let place = Place::empty();
     place.add_landscape();
     let point = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
@@ -352,7 +352,7 @@ fn captures_keep_their_proportions_and_their_places() {
     let (mut page, about) = Page::open(&server.address);
     assert_eq!(json!([about["size"], about["photographs"][0]["size"]]), json!([[32, 24], [32, 24]]));
     assert!((about["proportion"].as_f64().unwrap() - 4.0 / 3.0).abs() < 1e-9);
-    // Back in the capture's coordinates, the point is where it was.
+    // In capture coordinates the point has its original position.
     let (given, to) = (about["points"][0][0].clone(), about["to_capture"].clone());
     let row = |r: usize| -> f64 {
         (0..3).map(|c| to[r][c].as_f64().unwrap() * given[c].as_f64().unwrap()).sum::<f64>()
@@ -363,7 +363,7 @@ fn captures_keep_their_proportions_and_their_places() {
     }
     assert_eq!(about["points"][0][1], json!([10, 20, 30]));
     assert!(row(0) != given[0].as_f64().unwrap(), "it was moved");
-    // All of a photograph is seen, in its own proportions, and its normals in the capture's axes.
+    // The whole image is shown in its own proportions, and normals are in the capture's axes.
     place.succeeds("render run --path test --size 32x24 --out color");
     place.succeeds("render run --path test --size 32x24 --show normals --out normals");
     let photographs = about["photographs"].as_array().unwrap();
@@ -375,7 +375,7 @@ fn captures_keep_their_proportions_and_their_places() {
         assert_eq!([seen.width, seen.height], [32, 24]);
         assert!(psnr(&seen, &expected) > 40.0, "{show} {id}: {}", psnr(&seen, &expected));
     }
-    // As a pinhole that is held there has it.
+    // As a pinhole camera at that pose sees it.
     let photograph = &photographs[first + 1];
     let eye = json!({ "free": { "pose": photograph["pose"], "fov": photograph["fov"] } });
     page.say(json!({ "ask": "save", "view": { "eye": eye, "size": [32, 24] } }));
@@ -385,7 +385,7 @@ fn captures_keep_their_proportions_and_their_places() {
 }
 
 #[test]
-fn built_in_images_are_each_their_own() {
+fn built_in_images_are_distinct() {
     let place = Place::empty();
     place.succeeds(&format!("train embedded --downscale 20 --steps 1 --out run {SMALL}"));
     let server = serve(&place, "view run");
@@ -412,19 +412,19 @@ fn images_are_compared_from_their_cameras() {
     let truth = png(&place.path("scene/test/r_1.png")).over([1.0; 3]);
     let map = colormap::error_map(&png(&place.path("test/0001.png")), &truth);
     assert!(psnr(&errors, &map) > 25.0, "{}", psnr(&errors, &map));
-    // A box, and what else lies behind the scene, are no fault of the model's.
+    // A crop box and another background do not count as errors.
     let mut cropped = view.clone();
     (cropped["crop"], cropped["background"]) = (json!([[50, 50, 50], [51, 51, 51]]), json!([0, 0, 255]));
     assert_eq!(page.look(11, &cropped).pop().unwrap().0["compared"], head["compared"]);
     assert_eq!(head["compared"][0], 7);
     let [seen, expected] = [&head["compared"][1], &scores["per_view"][1]["psnr"]].map(|x| x.as_f64().unwrap());
     assert!((seen - expected).abs() < 0.01, "{seen} {expected}");
-    // One is not made larger to be compared, and shown whole beside others.
+    // An image is not enlarged for a comparison, and is shown whole beside others.
     let large = json!({ "eye": { "photograph": 7 }, "size": [300, 90], "compared": true });
     let (head, picture) = page.look(3, &large).pop().unwrap();
     assert_eq!([picture.width, picture.height], [SIZE, SIZE]);
     assert!((head["compared"][1].as_f64().unwrap() - expected).abs() < 0.01 && head["compared"][2] == true);
-    // At another size it is another figure, and coarse pictures have none.
+    // At another size the value differs, and coarse images have none.
     let pictures = page.look(14, &json!({ "eye": { "photograph": 7 }, "size": [20, 20], "compared": true }));
     let compared: Vec<&Value> = pictures.iter().map(|(head, _)| &head["compared"]).collect();
     assert!(compared.last().unwrap()[1].is_f64() && compared.iter().all(|told| told[2] == false), "{compared:?}");
@@ -432,11 +432,11 @@ fn images_are_compared_from_their_cameras() {
     let large = json!({ "eye": { "photograph": 7 }, "size": [300, 90] });
     let picture = page.look(4, &large).pop().unwrap().1;
     assert_eq!([picture.width, picture.height], [90, 90]);
-    // From elsewhere, the nearest.
+    // From a free camera, the nearest image.
     let mut near = view.clone();
     near["eye"] = json!({ "free": { "pose": about["photographs"][4]["pose"], "fov": 30.0 } });
     assert_eq!(page.look(2, &near).pop().unwrap().0["compared"][0], 4);
-    // How a camera is held counts as much as where it is.
+    // The orientation of a camera counts as much as its position.
     let [mut pose, other] = [5, 4].map(|i: usize| about["photographs"][i]["pose"].clone());
     for row in 0..3 {
         let [own, other] = [&pose, &other].map(|pose| pose[row][3].as_f64().unwrap());
@@ -450,7 +450,7 @@ fn images_are_compared_from_their_cameras() {
     assert!(head["number"] == 3 && psnr(&decoded(&bytes), &photograph) > 30.0);
     page.say(json!({ "ask": "photograph", "number": 99 }));
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("no image 99"));
-    // Before what evaluations have behind the scene; and those that are to test with are there once.
+    // With the background of evaluations; and each test image is listed once.
     place.succeeds("prepare scene --to nerfstudio --out captured");
     place.succeeds(&format!("train captured --scene-type bounded --background black --steps 150 --out black {SMALL}"));
     place.succeeds("eval black");
@@ -472,12 +472,12 @@ fn images_are_compared_from_their_cameras() {
     let (head, _) = page.look(1, &asked).pop().unwrap();
     let [seen, expected] = [&head["compared"][1], &scores["per_view"][0]["psnr"]].map(|x| x.as_f64().unwrap());
     assert!((seen - expected).abs() < 0.02, "{seen} {expected}");
-    // What lies behind is as in training, in photographs too.
+    // The background is that of training, also behind images.
     let (_, seen) = page.look(2, &first(&about, [32, 32])).pop().unwrap();
     page.say(json!({ "ask": "photograph", "number": numbers[0] }));
     let photograph = decoded(&page.file("photograph").1);
     assert!(seen.data[0] < 0.2 && photograph.data[0] < 0.2, "{} {}", seen.data[0], photograph.data[0]);
-    // Without them, or with others, the rest is there.
+    // Without images, or with other ones, the rest works.
     let server = serve(&place, "view run --scene captured");
     assert_eq!(Page::open(&server.address).1["photographs"], json!([]));
     std::fs::rename(place.path("scene"), place.path("gone")).unwrap();
@@ -494,9 +494,9 @@ fn images_are_compared_from_their_cameras() {
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("not available"));
 }
 
-/// Each has its own in evaluations, and pages have the mean of all.
+/// Evaluations use the embedding of each image, but pages use the mean of all.
 #[test]
-fn photographs_with_codes_of_their_own_have_no_figure() {
+fn images_with_embeddings_have_no_psnr() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 60 --set field.appearance_embedding_dim=2 --out run {SMALL}"));
     place.succeeds("eval run");
@@ -513,7 +513,7 @@ fn photographs_with_codes_of_their_own_have_no_figure() {
 }
 
 #[test]
-fn a_page_is_opened_in_the_browser() {
+fn view_opens_the_browser() {
     use std::os::unix::fs::PermissionsExt;
     let place = Place::with_scene();
     let said = place.succeeds(&format!("train scene --steps 2 --out run {SMALL}"));
@@ -546,7 +546,7 @@ fn viewer_refuses_others_without_the_token() {
     let (status, head, body) = request(address, &format!("GET / HTTP/1.1\r\nHost: {address}"));
     assert!(status == 200 && body.contains("<title>raygrad</title>"), "{head}");
     assert_eq!(request(address, &format!("GET / HTTP/1.1\r\nHost: evil.example:{port}")).0, 421);
-    // A port that is taken is named.
+    // An error names the port in use.
     place.fails(&format!("view run --port {port}"), &["`host`", port, "cannot be used"]);
     place.fails("view run --host nowhere.invalid", &["`host`", "nowhere.invalid"]);
     place.fails_with("train scene --steps 1 --out other --port 1", "`view`: is missing: --host and --port need --view");
@@ -568,19 +568,19 @@ fn malformed_message_closes_its_connection() {
     let (mut page, _) = Page::open(&server.address);
     page.say(json!({ "ask": "view", "id": 1, "view": first(&about, [4096, 4096]) }));
     assert!(page.closed().contains("4096x4096 is not a size"));
-    // A photograph of no such number is said not to be there, and the other page is still served.
+    // An error names an unknown image, and the other page is still served.
     good.say(json!({ "ask": "view", "id": 5, "view": { "eye": { "photograph": 4000 }, "size": [16, 16] } }));
     assert!(good.text("sorry")["what"].as_str().unwrap().contains("no such image"));
     assert_eq!(good.look(6, &first(&about, [16, 16])).pop().unwrap().0["id"], 6);
 }
 
 #[test]
-fn the_newest_camera_wins() {
+fn newest_camera_replaces_older_requests() {
     let place = trained();
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
     let mut view = first(&about, [300, 300]);
-    // All but the last of many are hardly painted.
+    // All but the last of many views are hardly rendered.
     for id in 1..=100 {
         view["eye"]["free"]["pose"][0][3] = json!(0.01 * f64::from(id));
         page.say(json!({ "ask": "view", "id": id, "view": view }));
@@ -613,7 +613,7 @@ fn training_viewer_pauses_and_stops_same_model() {
     let held = head["step"].as_u64().unwrap();
     page.texts.clear();
     assert_eq!(page.text("training")["step"], held, "it waits");
-    // One that comes back soon, loaded anew, finds it as it was.
+    // A page that reconnects soon finds the training as it was.
     drop(page);
     std::thread::sleep(Duration::from_millis(600));
     let (mut page, _) = Page::open(&server.address);
@@ -623,7 +623,7 @@ fn training_viewer_pauses_and_stops_same_model() {
     page.say(json!({ "ask": "share", "share": 0.5 }));
     while page.text("training")["share"] != 0.5 {}
     page.say(json!({ "ask": "pause", "pause": false }));
-    // It is seen again as it learns, until it has ended.
+    // Rendering continues with training until its end.
     let mut again = held;
     let ended = loop {
         while let Some((head, _)) = page.files.pop_front() {
@@ -637,7 +637,7 @@ fn training_viewer_pauses_and_stops_same_model() {
     assert!(again > held, "{again}");
     assert_eq!(json!([ended["step"], ended["ended"]]), json!([300, "done"]));
     assert!(ended["curves"]["loss"].as_array().unwrap().len() > 10, "{ended}");
-    // The scene is shown until the page has gone; meanwhile the run is anyone's.
+    // The viewer stays open until its page closes; meanwhile the run is unlocked.
     page.say(json!({ "ask": "view", "id": 9, "view": view }));
     while page.file("picture").0["step"] != 300 {}
     place.succeeds("train --resume run --steps 300");
@@ -649,7 +649,7 @@ fn training_viewer_pauses_and_stops_same_model() {
         assert_eq!(said.matches(words).count(), 1, "{words}: {said}");
     }
 
-    // Ended from the page, it can be gone on with.
+    // A run stopped from the page can be resumed.
     let mut server = serve(&place, &format!("train scene --steps 300 --view --out other {SMALL}"));
     let (mut page, _) = Page::open(&server.address);
     page.say(json!({ "ask": "pause", "pause": true }));
@@ -666,7 +666,7 @@ fn training_viewer_pauses_and_stops_same_model() {
 #[test]
 fn viewer_checkpoints_and_skips_equal_render() {
     let place = Place::with_scene();
-    // Of even steps, short ones leave out what shows.
+    // With uniform steps, short ones skip visible parts.
     let train = format!("train scene --steps 150 --checkpoint-every 0.02s {SMALL} --set sampler.cone=0");
     place.succeeds(&format!("{train} --keep-checkpoints 500 --out run"));
     assert_eq!(place.command("train scene --keep-checkpoints 1").output().unwrap().status.code(), Some(2));
@@ -686,7 +686,7 @@ fn viewer_checkpoints_and_skips_equal_render() {
         decoded(&page.file("save").1)
     };
     let last = kept(&mut page, &view);
-    // A run that is ended at a checkpoint has the model of it.
+    // A run that ended at a checkpoint has the same model.
     let earlier = *steps.iter().find(|step| **step > 30).unwrap();
     place.succeeds(&format!("{train} --keep-checkpoints 3 --out other"));
     let checkpoints = place.path("other/checkpoints");
@@ -697,7 +697,7 @@ fn viewer_checkpoints_and_skips_equal_render() {
     std::fs::copy(place.path(&format!("run/checkpoints/{name}")), checkpoints.join(name)).unwrap();
     place.succeeds(&format!("train --resume other --steps {earlier}"));
     place.succeeds("render other --frames 1 --size 64x64 --out earlier");
-    // On a busy machine that takes so long that a page that says nothing is taken to be gone.
+    // On a busy machine this takes so long that the server drops the silent page.
     let (mut page, _) = Page::open(&server.address);
     let at_earlier = with("checkpoint", json!(earlier));
     assert_eq!(page.look(2, &at_earlier).pop().unwrap().0["step"], earlier);
@@ -705,10 +705,10 @@ fn viewer_checkpoints_and_skips_equal_render() {
     let expected = png(&place.path("earlier/0000.png"));
     assert!(psnr(&before, &expected) > 50.0, "{}", psnr(&before, &expected));
     assert!(psnr(&last, &expected) < 40.0, "{}", psnr(&last, &expected));
-    // The last one is what the run ended with, but for its rounding.
+    // The last checkpoint equals the final model, up to its rounding.
     let same = kept(&mut page, &with("checkpoint", json!(150)));
     assert!(psnr(&same, &last) > 50.0, "{}", psnr(&same, &last));
-    // More of them than are kept in memory, and back.
+    // More than fit in memory, and back.
     for (id, step) in (4..).zip([steps[1], steps[2], steps[3], steps[4], steps[1]]) {
         assert_eq!(page.look(id, &with("checkpoint", json!(step))).pop().unwrap().0["step"], step);
     }
@@ -724,14 +724,14 @@ fn viewer_checkpoints_and_skips_equal_render() {
             assert!(psnr(&seen, &expected) > 45.0, "{skip} {show} {id}: {}", psnr(&seen, &expected));
         }
     }
-    // Each is its own.
+    // Each skip setting gives its own image.
     let [off, fast] = ["off", "fast"].map(|skip| png(&place.path(&format!("{skip}-color/0000.png"))));
     assert!(psnr(&off, &fast) < 65.0, "{}", psnr(&off, &fast));
     for (skip, own, other) in [("off", &off, &fast), ("fast", &fast, &off)] {
         let seen = kept(&mut page, &with("skip", json!(skip)));
         assert!(psnr(&seen, own) > psnr(&seen, other), "{skip}: {} {}", psnr(&seen, own), psnr(&seen, other));
     }
-    // What is not there is said, and the rest goes on.
+    // An error names the absent checkpoint, and other requests continue.
     for kind in ["view", "save"] {
         page.say(
             json!({ "ask": kind, "id": 30, "view": with("checkpoint", json!(151)) })
@@ -757,7 +757,7 @@ fn viewer_checkpoints_and_skips_equal_render() {
     assert_eq!(page.look(34, &view).pop().unwrap().0["step"], 0);
 }
 
-/// A path between two key frames, as the page saves it.
+/// A path between two keyframes, as the page saves it.
 fn path(about: &Value, seconds: f64) -> Value {
     let frame = |fov: f64| {
         let pose = about["photographs"][0]["pose"].as_array().unwrap();
@@ -770,7 +770,7 @@ fn path(about: &Value, seconds: f64) -> Value {
 }
 
 #[test]
-fn videos_are_made_one_at_a_time_beside_what_is_seen() {
+fn videos_are_made_one_at_a_time_beside_views() {
     let place = trained();
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
@@ -789,12 +789,12 @@ fn videos_are_made_one_at_a_time_beside_what_is_seen() {
         "{video}"
     );
     assert!(!place.path(&format!("{video}.frames")).exists());
-    // The same by hand is the same.
+    // Rendering the same path by hand gives the same video.
     let ending = video.rsplit('.').next().unwrap();
     place.succeeds(&format!("render run --path run/videos/video-1.json --show depth --overwrite --out again.{ending}"));
     let bytes = [video, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
     assert!(bytes[0] == bytes[1]);
-    // One that takes long does not hold up pictures or let another begin, until it is ended.
+    // A long video blocks a second one, but neither views nor its cancellation.
     page.say(json!({ "ask": "video", "path": path(&about, 600.0) }));
     page.text("video");
     page.say(json!({ "ask": "video", "path": path(&about, 1.0) }));
@@ -804,7 +804,7 @@ fn videos_are_made_one_at_a_time_beside_what_is_seen() {
     assert_eq!(ended(&mut page)["words"], "cancelled");
     let videos = || std::fs::read_dir(place.path("run/videos")).unwrap().count();
     assert_eq!(videos(), 2, "nothing is left of it");
-    // As it is seen, with what is behind it and as much left out.
+    // With the layer, background and skip settings of the view.
     for (video, flags) in [
         (json!({ "path": path(&about, 0.4), "show": "normals", "skip": "off" }), "--show normals --skip off"),
         (json!({ "path": path(&about, 0.4), "show": "opacity" }), "--show opacity"),
@@ -821,13 +821,13 @@ fn videos_are_made_one_at_a_time_beside_what_is_seen() {
         let bytes = [&*video, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
         assert!(bytes[0] == bytes[1], "{flags}");
     }
-    // What is no path is said by who reads it.
+    // The parser's error names an invalid path.
     let mut fisheye = path(&about, 1.0);
     fisheye["camera_type"] = json!("fisheye");
     page.say(json!({ "ask": "video", "path": fisheye }));
     let words = ended(&mut page)["words"].as_str().unwrap().to_owned();
     assert!(words.contains("video-5.json") && words.contains("perspective"), "{words}");
-    // A program that ends ends the video with it.
+    // A program that ends also ends its video.
     page.say(json!({ "ask": "video", "path": path(&about, 600.0) }));
     let video = page.text("video")["file"].as_str().unwrap().to_owned();
     let frames = place.path(&format!("{video}.frames"));
@@ -862,7 +862,7 @@ fn viewer_knows_refined_cameras() {
         |told: &Value| told["photographs"].as_array().unwrap().iter().map(|p| p["pose"].clone()).collect::<Vec<_>>();
     assert!(poses(&taken).len() == poses(&about).len() && poses(&taken) != poses(&about));
     assert_ne!(taken["to_capture"], about["to_capture"]);
-    // Each near to where its own was, and not another's.
+    // Each is close to its own given pose, not to another's.
     let apart = |a: &Value, b: &Value| -> f64 {
         let at = |pose: &Value, row: usize| pose[row][3].as_f64().unwrap();
         (0..3).map(|row| (at(a, row) - at(b, row)).powi(2)).sum()
@@ -872,18 +872,18 @@ fn viewer_knows_refined_cameras() {
             poses(&about).iter().map(|other| apart(own, other)).enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
         assert_eq!(nearest.unwrap().0, i);
     }
-    // Who comes later is told what is known by then.
+    // A page that connects later gets the current cameras.
     let (_, later) = Page::open(&server.address);
     assert_ne!(poses(&later), poses(&about));
 }
 
 #[test]
-fn a_page_at_rest_takes_no_time() {
+fn idle_page_uses_no_cpu_time() {
     let place = trained();
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
     page.look(1, &first(&about, [32, 32]));
-    // In hundredths of a second, where the system says.
+    // In hundredths of a second, if the system reports it.
     let taken = || -> Option<u64> {
         let text = std::fs::read_to_string(format!("/proc/{}/stat", server.child.id())).ok()?;
         let numbers: Vec<&str> = text.rsplit(')').next()?.split_whitespace().collect();
@@ -898,7 +898,7 @@ fn a_page_at_rest_takes_no_time() {
 }
 
 #[test]
-fn photographs_that_cannot_be_read_are_named() {
+fn unreadable_images_are_named() {
     let place = trained();
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
@@ -911,7 +911,7 @@ fn photographs_that_cannot_be_read_are_named() {
     page.look(2, &first(&about, [16, 16]));
 }
 
-/// The same view from elsewhere: turned about the vertical, in radians.
+/// The view turned about the vertical, in radians.
 fn turned(view: &Value, angle: f64) -> Value {
     let (sin, cos) = angle.sin_cos();
     let mut view = view.clone();
@@ -924,7 +924,8 @@ fn turned(view: &Value, angle: f64) -> Value {
     view
 }
 
-/// `VIEWED=RUN,RUN cargo test --release --test cli milliseconds -- --nocapture` measures runs of one's own, by their whole paths.
+/// `VIEWED=RUN,RUN cargo test --release --test cli milliseconds -- --nocapture` measures other runs, given by absolute
+/// paths.
 #[test]
 fn milliseconds_from_drag_to_first_and_final_image() {
     let place = trained();
@@ -935,7 +936,7 @@ fn milliseconds_from_drag_to_first_and_final_image() {
         let server = serve(&place, &format!("view {run}"));
         let (mut page, about) = Page::open(&server.address);
         let view = first(&about, [side, side]);
-        // The first ones find out how quick this machine is.
+        // The first views measure the speed of the machine.
         page.look(0, &view);
         let count = if given.is_some() { 15 } else { 4 };
         let (mut firsts, mut wholes, mut coarse) = (vec![], vec![], 0);
@@ -960,7 +961,7 @@ fn milliseconds_from_drag_to_first_and_final_image() {
             }
             firsts.push(begun.unwrap());
         }
-        // A hand that never rests: the next view as soon as a picture came.
+        // A continuous drag: the next view as soon as an image arrives.
         let (start, mut frames) = (Instant::now(), 0);
         let seconds = if given.is_some() { 5.0 } else { 0.5 };
         while start.elapsed().as_secs_f64() < seconds {
@@ -983,14 +984,15 @@ fn milliseconds_from_drag_to_first_and_final_image() {
     }
 }
 
-/// `COST=SCENE cargo test --release --test cli what_pages_cost -- --nocapture` measures how much longer training on a scene takes.
+/// `COST=SCENE cargo test --release --test cli page_cost -- --nocapture` measures how much longer training on a scene
+/// takes.
 #[test]
-fn what_pages_cost_training() {
+fn page_cost_during_training() {
     const ROUNDS: usize = 7;
     let Ok(scene) = std::env::var("COST") else { return };
     let place = Place::empty();
-    // How long training takes as a whole, and the processor (clock ticks of children that have ended, those of other tests at the
-    // same time, too): without a page, with one that nobody looks at, with one that is looked at.
+    // The time and CPU use of training without a page, with a hidden page and with a visible one. The clock ticks of
+    // ended children include those of other tests.
     let processor = || -> f64 {
         let text = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
         let (_, numbers) = text.rsplit_once(')').unwrap_or_default();
@@ -1024,7 +1026,7 @@ fn what_pages_cost_training() {
         let [without, rest, looks] = [None, Some(false), Some(true)].map(|looks| seconds(round, looks));
         idle.push(rest[0] / without[0]);
         busy.push(looks[0] / without[0]);
-        // Elsewhere than on Linux there is none.
+        // Only Linux reports it.
         if without[1] > 0.0 {
             used.push(rest[1] / without[1]);
         }
@@ -1042,9 +1044,10 @@ fn what_pages_cost_training() {
     }
 }
 
-/// `LOAD=all cargo test --release --test cli many_pages -- --nocapture` is the campaign: fifty pages, ten thousand messages that are none.
+/// `LOAD=all cargo test --release --test cli many_pages -- --nocapture` tests fifty pages and ten thousand invalid
+/// messages.
 #[test]
-fn many_pages_leave_memory_and_training_alone() {
+fn many_pages_do_not_affect_memory_or_training() {
     let all = std::env::var("LOAD").is_ok_and(|which| which == "all");
     let (pages, nonsense, steps) = if all { (50, 10_000, 6000) } else { (6, 100, 150) };
     let place = Place::with_scene();
@@ -1062,13 +1065,13 @@ fn many_pages_leave_memory_and_training_alone() {
     held.say(json!({ "ask": "pause", "pause": true }));
     while held.text("training")["paused"] != true {}
     let before = memory();
-    // Every third takes nothing that it asked for; two and two look the same way.
+    // Every third page reads nothing; pairs of pages share a view.
     let view = first(&about, [96, 96]);
     let mut others: Vec<Page> = (0..pages).map(|_| Page::open(&server.address).0).collect();
     for (i, page) in others.iter_mut().enumerate() {
         page.say(json!({ "ask": "view", "id": 1, "view": turned(&view, 0.1 * (i / 2) as f64) }));
     }
-    // Whoever takes pictures gets a whole one, beside the others.
+    // Pages that read get a complete image despite the others.
     let mut waiting: Vec<&mut Page> =
         others.iter_mut().enumerate().filter(|(i, _)| i % 3 != 0).map(|(_, p)| p).collect();
     while !waiting.is_empty() {

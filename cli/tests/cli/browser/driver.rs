@@ -1,4 +1,4 @@
-//! A browser without a window: Chromium by its DevTools protocol, Firefox by WebDriver BiDi.
+//! Drivers of headless browsers: Chromium by DevTools, Firefox by WebDriver BiDi.
 
 use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
@@ -16,7 +16,7 @@ use tungstenite::{Message, WebSocket};
 use super::super::view::Server;
 use super::super::{Place, png};
 
-/// Width and height of the browser's window, and pixels of the display to each of these: a program that is built for tests paints slowly.
+/// Width and height of the browser window, and the device pixel ratio. Debug builds render slowly.
 const WINDOW: [u32; 2] = [780, 150];
 const FINE: f64 = 0.5;
 
@@ -27,7 +27,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// By what name it is installed here, if it is.
+    /// The name of the installed program, if any.
     fn installed(self) -> Option<&'static str> {
         static NAMES: [OnceLock<Option<&str>>; 2] = [const { OnceLock::new() }; 2];
         let names: &[&str] = match self {
@@ -39,19 +39,19 @@ impl Kind {
     }
 }
 
-/// Runs a program until this one has ended, or lets go of its input, and removes a folder then.
+/// Runs a program until this one ends or closes its input; then removes a folder.
 const UNTIL_LET_GO: &str = r#"folder="$1"; shift; "$@" & exec >&- 2>&-; read -r _; kill -9 $!; wait; rm -rf "$folder""#;
 
-/// Programs of Firefox that no test uses: it takes seconds to start.
+/// Idle Firefox programs for reuse, since starting one takes seconds.
 static IDLE: Mutex<Vec<Program>> = Mutex::new(vec![]);
 
-/// A browser that was started.
+/// A running browser.
 struct Program {
     child: Child,
-    /// What Firefox needs for WebGL, if it is installed: a display.
+    /// The virtual display that Firefox needs for WebGL, if installed.
     display: Option<Child>,
     socket: WebSocket<MaybeTlsStream<TcpStream>>,
-    /// The folder with its settings, and what it has kept.
+    /// The folder with its settings and downloads.
     profile: PathBuf,
 }
 
@@ -65,7 +65,7 @@ impl Drop for Program {
 }
 
 impl Program {
-    /// Nothing, which it says, where there is none.
+    /// Starts a browser; returns `None` and prints a message if it is not installed.
     fn start(kind: Kind) -> Option<Self> {
         let Some(name) = kind.installed() else {
             println!("skipped: {kind:?} is not installed");
@@ -118,7 +118,7 @@ impl Program {
     }
 }
 
-/// A command that ends with this program, and whose folder goes then.
+/// A command that ends with this program and then removes its folder.
 fn until_let_go(folder: &Path, program: &str) -> Command {
     let mut command = Command::new("sh");
     command.args(["-c", UNTIL_LET_GO, "sh"]).arg(folder).arg(program).stdin(Stdio::piped());
@@ -128,12 +128,12 @@ fn until_let_go(folder: &Path, program: &str) -> Command {
 /// A browser with one page.
 pub struct Browser {
     pub kind: Kind,
-    /// Until this is dropped.
+    /// Present until this is dropped.
     program: Option<Program>,
-    /// Of DevTools the session, of BiDi the page.
+    /// The DevTools session, or the BiDi context.
     page: String,
     number: u64,
-    /// What scripts of the page complained of.
+    /// Console errors of the page.
     pub complaints: Vec<String>,
 }
 
@@ -146,12 +146,12 @@ impl Drop for Browser {
 }
 
 impl Browser {
-    /// Those that are installed; says which is not.
+    /// All installed browsers; prints the absent ones.
     pub fn all() -> impl Iterator<Item = Self> {
         [Kind::Chromium, Kind::Firefox].into_iter().filter_map(Self::open)
     }
 
-    /// Nothing, which it says, where there is none.
+    /// Opens a browser; returns `None` and prints a message if it is not installed.
     pub fn open(kind: Kind) -> Option<Self> {
         let idle = if kind == Kind::Firefox { IDLE.lock().unwrap().pop() } else { None };
         let is_new = idle.is_none();
@@ -182,7 +182,7 @@ impl Browser {
                 }
                 self.page = text(&self.call("browsingContext.getTree", json!({}))["contexts"][0]["context"]);
                 self.go("about:blank");
-                // Those of the page before.
+                // Errors of the previous page.
                 self.complaints.clear();
             }
         }
@@ -192,7 +192,7 @@ impl Browser {
         self.program.as_mut().unwrap()
     }
 
-    /// What the browser answers to a message of its protocol.
+    /// Sends a protocol message and returns the answer.
     #[track_caller]
     pub fn call(&mut self, method: &str, parameters: Value) -> Value {
         self.number += 1;
@@ -220,7 +220,7 @@ impl Browser {
         }
     }
 
-    /// The value of an expression in the page.
+    /// Evaluates an expression in the page.
     #[track_caller]
     pub fn value(&mut self, expression: &str) -> Value {
         let (asked, method) = match self.kind {
@@ -237,7 +237,7 @@ impl Browser {
         }
     }
 
-    /// The same, as a number.
+    /// Evaluates an expression to a number.
     #[track_caller]
     pub fn number(&mut self, expression: &str) -> f64 {
         let value = self.value(expression);
@@ -266,15 +266,15 @@ impl Browser {
         };
     }
 
-    /// Opens the page of a program, and waits for the scene.
+    /// Opens a program's page and waits for the scene.
     pub fn visit(&mut self, server: &Server) {
         self.go(&format!("http://{}/", server.address));
         self.rested();
-        // The stage may change its size once more while the page is laid out.
+        // The layout may change the canvas size once more.
         self.until("String(shown.size) === String(sizes())");
     }
 
-    /// Whether it has WebGL 2, and says that it skips if not: Firefox without a display has none.
+    /// Returns true if WebGL 2 is available; prints a skip message otherwise. Firefox needs a display for it.
     pub fn draws(&mut self) -> bool {
         let draws = self.value("document.createElement('canvas').getContext('webgl2') !== null") == true;
         assert!(draws || self.kind == Kind::Firefox);
@@ -284,15 +284,15 @@ impl Browser {
         draws
     }
 
-    /// Waits for the whole picture of what was asked for last.
+    /// Waits for the complete image of the last request.
     #[track_caller]
     pub fn rested(&mut self) {
         self.until("document.readyState === 'complete' && typeof about !== 'undefined' && about !== null");
-        // What was done is asked for a moment later.
+        // A change is requested a moment later.
         self.until("shown !== null && !waits && !again && shown.id === asked && shown.whole");
     }
 
-    /// From the middle of the scene, by so many pixels.
+    /// Drags from the middle of the scene, in pixels.
     pub fn drag(&mut self, by: [f64; 2], button: &str) {
         let middle = self.middle();
         self.drag_from(middle, by, button);
@@ -302,7 +302,7 @@ impl Browser {
         self.centre("stage")
     }
 
-    /// Where the middle of an element is.
+    /// The position of the middle of an element.
     pub fn centre(&mut self, element: &str) -> [f64; 2] {
         let at = self.value(&format!(
             "(() => {{ const r = {element}.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()"
@@ -310,7 +310,7 @@ impl Browser {
         [0, 1].map(|axis| at[axis].as_f64().unwrap())
     }
 
-    /// Whether an element is in sight, and nothing before it.
+    /// Returns true if an element is visible and not covered.
     pub fn sees(&mut self, id: &str) -> bool {
         self.value(&format!(
             "(() => {{ const it = document.getElementById('{id}'), r = it.getBoundingClientRect(); \
@@ -344,7 +344,7 @@ impl Browser {
         }
     }
 
-    /// A wheel above the middle of the scene.
+    /// Turns the wheel above the middle of the scene.
     pub fn wheel(&mut self, by: i32) {
         let [x, y] = self.middle();
         match self.kind {
@@ -360,7 +360,7 @@ impl Browser {
         }
     }
 
-    /// Presses a key, with Shift if it is written before.
+    /// Presses a key, with Shift if the name says so.
     pub fn key(&mut self, key: &str) {
         let (shift, key) = key.strip_prefix("Shift+").map_or((false, key), |key| (true, key));
         match self.kind {
@@ -394,7 +394,7 @@ impl Browser {
         self.call("input.performActions", json!({ "context": self.page, "actions": [source] }));
     }
 
-    /// Gives a control a value, as a hand does.
+    /// Sets the value of a control with its events.
     #[track_caller]
     pub fn set(&mut self, id: &str, value: impl Into<Value>) {
         let value = value.into();
@@ -429,7 +429,7 @@ impl Browser {
         }
     }
 
-    /// Waits for a file that the page gives to keep.
+    /// Waits for a download.
     #[track_caller]
     pub fn kept(&mut self, name: &str) -> PathBuf {
         let (start, path) = (Instant::now(), self.program().profile.join(name));
@@ -437,12 +437,12 @@ impl Browser {
             assert!(start.elapsed() < Duration::from_secs(30), "{name} was not kept");
             std::thread::sleep(Duration::from_millis(20));
         }
-        // All of it, which is moved there at once by some and written by others.
+        // Some browsers move the complete file there, others write it in place.
         std::thread::sleep(Duration::from_millis(100));
         path
     }
 
-    /// A picture of the page, for somebody to look at.
+    /// Saves a screenshot, if requested.
     pub fn shot(&mut self, name: &str) {
         let Ok(folder) = std::env::var("SHOTS") else { return };
         let png = match self.kind {
@@ -455,7 +455,7 @@ impl Browser {
             .unwrap();
     }
 
-    /// What the page shows of the scene.
+    /// The rendered image of the scene.
     pub fn picture(&mut self, place: &Place) -> Image {
         self.canvas("picture", place)
     }
@@ -470,7 +470,7 @@ impl Browser {
     }
 }
 
-/// A display that nobody sees, and its number.
+/// Starts a virtual display and returns its number.
 fn screen() -> Option<(Child, String)> {
     let mut command = until_let_go(Path::new(""), "Xvfb");
     command.args(["-displayfd", "1", "-nolisten", "tcp", "-screen", "0", "1280x1024x24"]);
@@ -480,7 +480,7 @@ fn screen() -> Option<(Child, String)> {
     Some((child, number.trim().to_owned()))
 }
 
-/// What BiDi tells of a value, which has a type beside it.
+/// Converts a BiDi value, which carries its type.
 fn plain(told: &Value) -> Value {
     let value = &told["value"];
     match told["type"].as_str().unwrap() {
