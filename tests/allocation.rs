@@ -1,6 +1,6 @@
-//! After its first steps, training takes every tensor from the pools of its tapes: nothing of tensor size is allocated.
+//! After its first steps, training takes every tensor from the pools of its tapes: no allocation has tensor size.
 //!
-//! The test has a binary of its own, because it counts what the whole process allocates.
+//! The test has its own binary, since it counts all allocations of the process.
 
 use raygrad::nerf::dataset::Split;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
@@ -10,21 +10,21 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// Rays in a step: so few that the lists of rays, which are drawn anew for each step, stay below [`SIZE`].
+/// Rays per step: few enough that the lists of rays, drawn anew for each step, stay below [`SIZE`].
 const BATCH: usize = 128;
 
-/// Bytes of the smallest tensor that a tile's work makes, one number for each coarse sample: 8 rays of 64 samples.
+/// Bytes of a tile's smallest tensor, one number per coarse sample: 8 rays of 64 samples.
 const SIZE: usize = 8 * 64 * 4;
 
-/// How many allocations of at least [`SIZE`] bytes there were.
+/// The number of allocations of at least [`SIZE`] bytes.
 static LARGE: AtomicUsize = AtomicUsize::new(0);
 
-/// The system's allocator, counting.
+/// The system's allocator, with a counter.
 struct Counting;
 
 fn count(layout: Layout, size: usize) {
-    // Vectors of f32 are aligned as an f32 is. That leaves out the scratch space of the matrix product, which is aligned
-    // to cache lines, and the tape's own bookkeeping, which holds pointers.
+    // Vectors of f32 have the alignment of f32. This leaves out the scratch space of the matrix product, which is
+    // aligned to cache lines, and the tape's bookkeeping, which holds pointers.
     if size >= SIZE && layout.align() == align_of::<f32>() {
         LARGE.fetch_add(1, Relaxed);
     }
@@ -34,7 +34,7 @@ fn count(layout: Layout, size: usize) {
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count(layout, layout.size());
-        // SAFETY: the caller's promises are passed on.
+        // SAFETY: the caller's promises hold for the system's allocator too.
         unsafe { System.alloc(layout) }
     }
 
@@ -54,7 +54,7 @@ unsafe impl GlobalAlloc for Counting {
 static ALLOCATOR: Counting = Counting;
 
 #[test]
-fn a_step_allocates_nothing_of_tensor_size() {
+fn training_step_allocates_no_tensor() {
     let data = Arc::new(embedded(Split::Val, 32));
     let mut small = Config::preset(Preset::Small);
     let quarter = ClassicConfig { width: 64, view_width: 32, ..ClassicConfig::paper() };

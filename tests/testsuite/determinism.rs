@@ -10,7 +10,7 @@ use raygrad::nerf::{
 use raygrad_scenes::embedded;
 use std::sync::Arc;
 
-/// Small networks, with more tiles than there are slots that sum gradients, and a last tile that is not full.
+/// Small networks, with more tiles than slots for gradient sums, and an incomplete last tile.
 fn config(seed: u64) -> Config {
     let field = ClassicConfig { depth: 2, width: 32, skip_layers: vec![], view_width: 16, ..ClassicConfig::paper() };
     let sampler = HierarchicalConfig {
@@ -25,7 +25,7 @@ fn config(seed: u64) -> Config {
     Config { field, sampler, seed, ..Config::preset(Preset::Small) }
 }
 
-/// A hash grid small enough to be hashed, marched.
+/// A marched hash grid with hashed levels.
 fn instant(seed: u64) -> Config {
     let mut config = Config { seed, ..Config::preset(Preset::Instant) };
     if let Some(field) = config.field.get_mut::<InstantConfig>() {
@@ -38,13 +38,13 @@ fn instant(seed: u64) -> Config {
     config
 }
 
-/// A grid of voxels with enough rows for several tasks of the optimiser, marched.
+/// A marched voxel grid with enough rows for several tasks of the optimizer.
 fn voxel(seed: u64) -> Config {
     let field = FieldConfig::new(VoxelConfig { resolution: 48, direction_degree: 2 });
     Config { field, sampler: instant(seed).sampler, seed, ..Config::preset(Preset::Voxel) }
 }
 
-/// What some steps and a view of the result leave, in bits.
+/// The bits of some steps and of a render.
 #[derive(Debug, PartialEq)]
 struct Outcome {
     params: Vec<u32>,
@@ -52,7 +52,7 @@ struct Outcome {
     losses: Vec<u64>,
 }
 
-/// Without `threads` from a thread that is none of rayon's, as the command line does.
+/// With `None` it runs on a thread outside of rayon, as the command line does.
 fn outcome(data: &Arc<Dataset>, config: Config, steps: u32, threads: Option<usize>) -> Outcome {
     let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
     let run = || {
@@ -73,9 +73,9 @@ fn outcome(data: &Arc<Dataset>, config: Config, steps: u32, threads: Option<usiz
 }
 
 #[test]
-fn training_and_views_any_threads_give_same_bits() {
+fn training_has_equal_bits_on_any_threads() {
     let data = Arc::new(embedded(Split::Val, 32));
-    // Marched models take more steps: their occupancy grids are to change on the way.
+    // Marched models take more steps, so that their occupancy grids change meanwhile.
     for (name, config, steps) in [("hierarchical", config(7), 5), ("instant", instant(7), 40), ("voxel", voxel(7), 40)]
     {
         let one = outcome(&data, config.clone(), steps, Some(1));
@@ -89,7 +89,7 @@ fn training_and_views_any_threads_give_same_bits() {
 }
 
 #[test]
-fn another_seed_gives_other_parameters_and_other_rays() {
+fn other_seed_gives_other_parameters_and_rays() {
     let data = Arc::new(embedded(Split::Val, 32));
     let [mut one, mut two] = [7, 8].map(|seed| Trainer::new(config(seed), data.clone()).unwrap());
     for ((name, a), b) in one.model.params.iter().zip(two.model.params.values()) {
@@ -100,8 +100,8 @@ fn another_seed_gives_other_parameters_and_other_rays() {
 }
 
 #[test]
-fn a_step_moves_every_parameter_tensor() {
-    // Without this the test above could pass on a trainer that does nothing.
+fn training_step_updates_every_parameter() {
+    // Without it, the test above could pass on a trainer that does nothing.
     let data = Arc::new(embedded(Split::Val, 32));
     let mut trainer = Trainer::new(config(7), data).unwrap();
     let before = trainer.model.params.clone();

@@ -1,4 +1,4 @@
-//! Faults that are planted in a good capture are found by name, and a good capture has none.
+//! The doctor names faults planted in a good capture, and finds none in the capture itself.
 
 use raygrad::nerf::dataset::{Capture, Format, Point, SceneAnalysis, SceneType, Split, View, evenly_spaced};
 use raygrad::nerf::doctor::{
@@ -11,10 +11,10 @@ use std::path::PathBuf;
 use std::sync::LazyLock;
 use tempfile::TempDir;
 
-/// Side of the images.
+/// The side of the images.
 const SIZE: usize = 160;
 
-/// Photographs of the embedded scene: 40 to train on, 8 to test on.
+/// Images of the embedded scene: 40 for training, 8 for testing.
 static PHOTOGRAPHS: LazyLock<Vec<(Split, Camera, Image)>> = LazyLock::new(|| {
     let of = |split: Split, count: usize| {
         let frames = evenly_spaced(embedded(split, SIZE).frames, count);
@@ -23,10 +23,10 @@ static PHOTOGRAPHS: LazyLock<Vec<(Split, Camera, Image)>> = LazyLock::new(|| {
     of(Split::Train, 40).chain(of(Split::Test, 8)).collect()
 });
 
-/// The files of these.
+/// Their encoded files.
 static FILES: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| PHOTOGRAPHS.iter().map(|(.., image)| image.to_png()).collect());
 
-/// A capture in a temporary folder, to plant faults in.
+/// A capture in a temporary folder for planted faults.
 struct Planted {
     folder: TempDir,
     capture: Capture,
@@ -82,7 +82,7 @@ impl Planted {
     }
 }
 
-/// Of a kind, with this severity, about the views of these numbers; and nothing else is above a note but `beside`.
+/// Checks a finding's severity and views. No other kind except `beside` may be above a note.
 #[track_caller]
 fn found(report: &Report, kind: Kind, severity: Severity, views: &[usize], beside: &[Kind]) {
     let finding = report.finds(kind).unwrap_or_else(|| panic!("no {kind} among {:#?}", report.findings));
@@ -97,7 +97,7 @@ fn found(report: &Report, kind: Kind, severity: Severity, views: &[usize], besid
 use Severity::{Error, Note, Warning};
 
 #[test]
-fn a_good_capture_has_no_findings() {
+fn good_capture_has_no_findings() {
     let report = Planted::new().report();
     assert!(report.findings.is_empty(), "{:#?}", report.findings);
     assert!(report.facts.agreement.unwrap() > 0.4, "{:?}", report.facts.agreement);
@@ -109,7 +109,7 @@ fn a_good_capture_has_no_findings() {
 }
 
 #[test]
-fn images_that_are_absent_broken_or_of_another_shape() {
+fn doctor_finds_absent_broken_and_misshapen_images() {
     let mut planted = Planted::new();
     planted.capture.views[3].image = None;
     found(&planted.cameras(), Kind::ImagesAbsent, Warning, &[3], &[]);
@@ -134,7 +134,7 @@ fn images_that_are_absent_broken_or_of_another_shape() {
 }
 
 #[test]
-fn cameras_that_no_one_has() {
+fn doctor_finds_implausible_cameras() {
     let mut planted = Planted::new();
     planted.camera(2).focal = [10.0; 2];
     found(&planted.cameras(), Kind::FieldOfView, Warning, &[2], &[]);
@@ -155,26 +155,26 @@ fn cameras_that_no_one_has() {
     found(&planted.cameras(), Kind::StrongDistortion, Note, &[9], &[]);
 }
 
-/// A pose as other programs would write it.
+/// A pose in another program's convention.
 type Convention = fn(DAffine3) -> DAffine3;
 
-/// With these signs of the camera's axes.
+/// Flips axes of the camera.
 fn turned(pose: DAffine3, signs: [f64; 3]) -> DAffine3 {
     DAffine3 { matrix3: pose.matrix3 * DMat3::from_diagonal(signs.into()), ..pose }
 }
 
-/// In OpenCV's axes: y down, z ahead.
+/// OpenCV's axes: y down, z ahead.
 fn opencv(pose: DAffine3) -> DAffine3 {
     turned(pose, [1.0, -1.0, -1.0])
 }
 
-/// In a world whose x has the other sign, with a column of the rotation negated, so that it stays one.
+/// Mirrors x of the world and negates a column of the rotation, which stays a rotation.
 fn mirrored(pose: DAffine3, signs: [f64; 3]) -> DAffine3 {
     turned(DAffine3::from_mat3(DMat3::from_diagonal(DVec3::new(-1.0, 1.0, 1.0))) * pose, signs)
 }
 
 #[test]
-fn conventions_are_told_apart() {
+fn doctor_identifies_pose_conventions() {
     let conventions: [(&str, Convention, Kind); 6] = [
         ("OpenCV", opencv, Kind::OpenCvAxes),
         ("world to camera", |pose| pose.inverse(), Kind::WorldToCamera),
@@ -185,7 +185,7 @@ fn conventions_are_told_apart() {
     ];
     for (name, convention, kind) in conventions {
         let mut planted = Planted::new();
-        // Not around the origin: as most captures are.
+        // Not around the origin, like most captures.
         let offset = DVec3::new(1.0, -2.0, 0.5);
         planted.repose(|pose| convention(DAffine3 { translation: pose.translation + offset, ..pose }));
         let surveyed = planted.report();
@@ -197,14 +197,14 @@ fn conventions_are_told_apart() {
 }
 
 #[test]
-fn poses_alone_tell_conventions_apart_too() {
+fn doctor_identifies_conventions_by_poses_alone() {
     let mut planted = Planted::new();
     planted.repose(opencv);
     found(&planted.cameras(), Kind::LooksAway, Warning, &[], &[Kind::CameraInBox, Kind::MissesBox]);
     let mut planted = Planted::new();
     planted.repose(|pose| pose.inverse());
     found(&planted.cameras(), Kind::WorldToCamera, Warning, &[], &[]);
-    // And points prove it.
+    // Points confirm it.
     let points =
         (0..100).map(|i| DVec3::new((f64::from(i) * 0.7).sin(), (f64::from(i) * 1.3).cos(), 0.01 * f64::from(i)));
     let points: Vec<Point> = points.map(|p| Point { position: 0.5 * p, color: [0; 3], error: 0.5, views: 4 }).collect();
@@ -216,7 +216,7 @@ fn poses_alone_tell_conventions_apart_too() {
 }
 
 #[test]
-fn scales_that_differ_and_digits_that_are_lost() {
+fn doctor_finds_wrong_scales_and_lost_digits() {
     let mut planted = Planted::new();
     planted.capture.points = vec![Point { position: DVec3::splat(5000.0), color: [0; 3], error: 0.1, views: 5 }; 20];
     found(&planted.cameras(), Kind::Scale, Warning, &[], &[]);
@@ -231,9 +231,9 @@ fn scales_that_differ_and_digits_that_are_lost() {
 }
 
 #[test]
-fn single_poses_that_are_wrong() {
+fn doctor_finds_single_wrong_poses() {
     let mut planted = Planted::new();
-    // Looks at the same place from another side than the photograph.
+    // The pose looks at the same place from another side than the image.
     let other = planted.camera(20).pose;
     let turn = DMat3::from_quat(DQuat::from_rotation_z(0.6));
     planted.camera(11).pose = DAffine3 { matrix3: turn * other.matrix3, translation: turn * other.translation };
@@ -271,7 +271,7 @@ fn single_poses_that_are_wrong() {
 }
 
 #[test]
-fn one_image_under_two_names() {
+fn doctor_finds_one_image_under_two_names() {
     let planted = Planted::new();
     std::fs::copy(planted.path(8), planted.path(9)).unwrap();
     found(
@@ -301,7 +301,7 @@ fn doctor_finds_blur_exposure_and_colour_jumps() {
 }
 
 #[test]
-fn masks_and_alpha_that_say_nothing() {
+fn doctor_finds_useless_masks_and_alpha() {
     let mut planted = Planted::new();
     planted.mask(3, 0.0);
     planted.mask(4, 1.0);
@@ -327,7 +327,7 @@ fn masks_and_alpha_that_say_nothing() {
 }
 
 #[test]
-fn places_that_give_no_depth_or_leave_gaps() {
+fn doctor_finds_missing_parallax_and_gaps() {
     let mut planted = Planted::new();
     planted.repose(|pose| DAffine3 { translation: DVec3::ZERO, ..pose });
     found(&planted.cameras(), Kind::OnePlace, Error, &[], &[]);
@@ -355,7 +355,7 @@ fn places_that_give_no_depth_or_leave_gaps() {
 }
 
 #[test]
-fn few_photographs_or_none_held_out() {
+fn doctor_finds_few_or_no_held_out_images() {
     let mut planted = Planted::new();
     planted.capture.views.retain(|view| view.split == Some(Split::Train));
     found(&planted.cameras(), Kind::NothingHeldOut, Note, &[], &[]);
@@ -370,7 +370,7 @@ fn few_photographs_or_none_held_out() {
 }
 
 #[test]
-fn every_kind_has_a_name_of_its_own() {
+fn finding_kinds_have_distinct_names() {
     let names: std::collections::BTreeSet<_> = Kind::ALL.iter().map(|kind| kind.name()).collect();
     assert_eq!(names.len(), Kind::ALL.len());
     for kind in Kind::ALL {
@@ -379,7 +379,7 @@ fn every_kind_has_a_name_of_its_own() {
     }
 }
 
-/// The mean over squares of pixels.
+/// A box blur.
 fn blurred(image: &Image, half: usize) -> Image {
     let mut out = image.clone();
     for y in 0..image.height {
@@ -396,7 +396,7 @@ fn blurred(image: &Image, half: usize) -> Image {
     out
 }
 
-/// With its colours multiplied.
+/// Multiplies the colours.
 fn tinted(image: &Image, factors: [f32; 3]) -> Image {
     let mut out = image.clone();
     for pixel in out.data.chunks_exact_mut(image.channels) {
@@ -411,7 +411,7 @@ fn good_capture_with_lens_and_masks_has_no_findings() {
     let size = [200, 130];
     let scene = Scene::bulldozer();
     let mut mask = Image { width: size[0], height: size[1], channels: 1, data: vec![1.0; size[0] * size[1]] };
-    // The right quarter, behind the bulldozer, is hidden.
+    // The right quarter, behind the bulldozer, is masked.
     (0..size[1]).for_each(|y| (150..size[0]).for_each(|x| mask.pixel_mut(x, y)[0] = 0.0));
     let hidden = planted.folder.path().join("mask.png");
     mask.save_png(&hidden).unwrap();
@@ -443,11 +443,11 @@ fn good_capture_with_lens_and_masks_has_no_findings() {
 }
 
 #[test]
-fn each_of_very_many_equal_poses_is_named_once() {
+fn doctor_names_each_of_many_equal_poses_once() {
     let mut planted = Planted::new();
     let (first, other) = (planted.capture.views[0].clone(), planted.capture.views[45].clone());
     let count = 1200;
-    // One of eight held out, or the last ones, or the first ones, as files have them.
+    // Every eighth, the last or the first images are held out, as files have them.
     let splits: [fn(usize) -> bool; 3] = [|i| i % 8 == 0, |i| i >= 600, |i| i < 600];
     for is_held_out in splits {
         let held_out = (0..count).filter(|i| is_held_out(*i)).count();
@@ -460,7 +460,8 @@ fn each_of_very_many_equal_poses_is_named_once() {
             .collect();
         let report = planted.cameras();
         let views = |kind: Kind| &report.finds(kind).unwrap().views;
-        // All held-out ones have the pose of a training one, but for the one elsewhere; all but the first of each that of another.
+        // All held-out images except an outlier share a pose with a training image. All but the first of each set share
+        // one with another.
         assert_eq!(views(Kind::Leak).len(), held_out - usize::from(is_held_out(5)));
         assert_eq!(views(Kind::DuplicatePoses).len(), count - 3);
         assert!(report.finds(Kind::DuplicatePoses).unwrap().what.starts_with("the pose of 1197 images is exactly"));
@@ -469,7 +470,7 @@ fn each_of_very_many_equal_poses_is_named_once() {
 }
 
 #[test]
-fn each_of_several_equal_poses_is_named_once() {
+fn doctor_names_each_of_few_equal_poses_once() {
     let mut planted = Planted::new();
     let pose = planted.capture.views[10].camera.pose;
     for i in [11, 12, 13] {

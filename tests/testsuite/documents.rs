@@ -1,35 +1,36 @@
-//! Rules for the Markdown files of the repository: line widths, sentence lengths, phrases, links and the summary of the book.
+//! Rules for the repository's Markdown files: line widths, sentence lengths, phrases, links and the summary of the
+//! book.
 //!
-//! `cargo test --test testsuite documents -- --nocapture` prints the figures, for comments of the sources too.
+//! `cargo test --test testsuite documents -- --nocapture` prints the figures, also for comments of the sources.
 
 use std::collections::HashMap;
 use std::fmt;
 use std::path::{Component, Path, PathBuf};
 
-/// Longest line in characters, in tables too.
+/// The longest line in characters, in tables too.
 const WIDTH: usize = 120;
-/// Most words of a sentence.
+/// The most words of a sentence.
 const LONGEST: usize = 30;
-/// Phrases that say less than plain ones.
+/// Phrases that have shorter synonyms.
 const BANNED: [&str; 8] =
     ["it is said", "is found out", "whoever", "is dear", "one's own", "as it lies", "goes on", "is asked for"];
-/// Pages of short facts that the program's tests write.
+/// Generated pages of short facts.
 const GENERATED: [&str; 2] = ["docs/reference/commands.md", "docs/reference/config.md"];
-/// Their full stop ends no sentence.
+/// Abbreviations whose full stop does not end a sentence.
 const ABBREVIATIONS: [&str; 7] = ["al.", "e.g.", "i.e.", "vs.", "cf.", "Fig.", "No."];
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The files of the repository whose names end like this, by path from its root.
+/// The repository's files with an extension, by path from its root.
 fn files(extension: &str) -> Vec<PathBuf> {
     fn visit(folder: &Path, extension: &str, files: &mut Vec<PathBuf>) {
         for entry in std::fs::read_dir(folder).unwrap() {
             let entry = entry.unwrap();
             let (path, name) = (entry.path(), entry.file_name().to_string_lossy().into_owned());
             if entry.file_type().unwrap().is_dir() {
-                // Built files, folders of tools, and runs.
+                // Build output, hidden folders and runs.
                 let is_skipped =
                     name.starts_with('.') || name.starts_with("target") || path.join("config.json").exists();
                 if !is_skipped && name != "node_modules" {
@@ -50,7 +51,7 @@ fn read(file: &Path) -> String {
     std::fs::read_to_string(root().join(file)).unwrap_or_else(|error| panic!("{}: {error}", file.display()))
 }
 
-/// Something that departs from a rule.
+/// A violation of a rule.
 struct Finding {
     file: PathBuf,
     line: usize,
@@ -69,19 +70,19 @@ fn assert_none(rule: &str, findings: &[Finding]) {
     assert!(findings.is_empty(), "{rule}: {} findings{}", findings.len(), lines.concat());
 }
 
-/// What a line of Markdown is.
+/// The kind of a line of Markdown.
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum Kind {
     Code,
     Table,
     Heading,
     Blank,
-    /// The first line of an item of a list.
+    /// The first line of a list item.
     Item,
     Text,
 }
 
-/// The lines of a Markdown text with their kinds.
+/// The lines of a Markdown text, with their kinds.
 fn lines(text: &str) -> Vec<(Kind, &str)> {
     let mut fence: Option<&str> = None;
     let mut is_comment = false;
@@ -107,7 +108,7 @@ fn lines(text: &str) -> Vec<(Kind, &str)> {
             () if bare.is_empty() => Kind::Blank,
             () if bare.starts_with('|') => Kind::Table,
             () if bare.starts_with('#') && bare.trim_start_matches('#').starts_with(' ') => Kind::Heading,
-            // An instruction to mdBook, or a tag of HTML.
+            // A directive of mdBook or an HTML tag.
             () if bare.starts_with("{{") || bare.starts_with('<') && bare.ends_with('>') => Kind::Blank,
             () if ["- ", "* ", "+ "].iter().any(|mark| bare.starts_with(mark)) => Kind::Item,
             () if digits.len() < bare.len() && digits.starts_with(". ") => Kind::Item,
@@ -118,7 +119,7 @@ fn lines(text: &str) -> Vec<(Kind, &str)> {
     text.lines().map(|line| (kind(line), line)).collect()
 }
 
-/// Paragraphs and items of lists, as one line each without what surrounds them, with the number of their first line.
+/// Paragraphs and list items as one line each, with the number of their first line.
 fn paragraphs(text: &str) -> Vec<(usize, String)> {
     let mut all: Vec<(usize, String)> = vec![];
     let mut is_open = false;
@@ -145,7 +146,7 @@ fn paragraphs(text: &str) -> Vec<(usize, String)> {
     all
 }
 
-/// A paragraph's words as they are read: code is one word, of a link the text counts.
+/// The words of a paragraph as they are read: code is one word, and of a link the text counts.
 fn plain(paragraph: &str) -> String {
     let mut text = String::new();
     for (part, is_code) in paragraph.split('`').zip([false, true].into_iter().cycle()) {
@@ -181,7 +182,7 @@ fn words(sentence: &str) -> usize {
     sentence.split(' ').count()
 }
 
-/// Lengths of sentences, as figures.
+/// Statistics of sentence lengths.
 #[derive(Default)]
 struct Lengths {
     sentences: usize,
@@ -221,7 +222,7 @@ fn banned(text: &str) -> impl Iterator<Item = &'static str> {
     })
 }
 
-/// The anchors of a page, as GitHub makes them.
+/// The anchors of a page by GitHub's rules.
 fn anchors(file: &Path, text: &str) -> Vec<String> {
     let mut all: Vec<String> = vec![];
     let mut seen: HashMap<String, usize> = HashMap::new();
@@ -232,7 +233,7 @@ fn anchors(file: &Path, text: &str) -> Vec<String> {
             all.push(if *count == 0 { title.clone() } else { format!("{title}-{count}") });
             *count += 1;
         }
-        // An include of mdBook.
+        // An mdBook include.
         if let Some(other) = line.trim().strip_prefix("{{#include ").and_then(|rest| rest.strip_suffix("}}")) {
             let other = normal(&file.with_file_name(other));
             all.extend(anchors(&other, &read(&other)));
@@ -244,7 +245,7 @@ fn anchors(file: &Path, text: &str) -> Vec<String> {
     all
 }
 
-/// A heading's anchor: in lower case, without punctuation, with hyphens for blanks.
+/// The anchor of a heading: lower case, without punctuation, hyphens for spaces.
 fn heading(title: &str) -> String {
     let mut text = title.trim().to_owned();
     while let Some((start, after)) = text.split_once("](") {
@@ -255,7 +256,7 @@ fn heading(title: &str) -> String {
     kept.flat_map(char::to_lowercase).map(|c| if c == ' ' { '-' } else { c }).collect()
 }
 
-/// A path without `..`.
+/// Normalises a path without `..`.
 fn normal(path: &Path) -> PathBuf {
     let mut out = PathBuf::new();
     for part in path.components() {
@@ -292,7 +293,7 @@ fn links(text: &str) -> Vec<(usize, String)> {
     all
 }
 
-/// What is wrong with a link, if anything.
+/// The problem of a link, if any.
 fn check_link(file: &Path, target: &str) -> Option<String> {
     let (path, anchor) = target.split_once('#').map_or((target, None), |(path, anchor)| (path, Some(anchor)));
     let other = if path.is_empty() { file.to_path_buf() } else { normal(&file.with_file_name(path)) };
@@ -369,7 +370,7 @@ fn documents_have_no_banned_phrase() {
 }
 
 #[test]
-fn documents_links_lead_somewhere() {
+fn documents_links_have_targets() {
     let (mut findings, mut count) = (vec![], 0);
     for file in files("md") {
         for (line, target) in links(&read(&file)) {
@@ -410,7 +411,7 @@ fn documents_are_all_in_the_summary() {
     assert_none("the summary has each page of docs once", &findings);
 }
 
-/// Figures of the sources' documentation comments; no rule for them.
+/// Prints figures of the sources' documentation comments, without a rule.
 #[test]
 fn documents_in_rustdoc_are_counted() {
     let mut crates: Vec<(String, Lengths)> = vec![];
@@ -421,7 +422,7 @@ fn documents_in_rustdoc_are_counted() {
         for line in text.lines() {
             let line = line.trim_start();
             let comment = line.strip_prefix("///").or_else(|| line.strip_prefix("//!"));
-            // What lies between two comments ends a paragraph, and every line has its number.
+            // Code between two comments ends a paragraph, and every line counts.
             block += comment.unwrap_or_default();
             block.push('\n');
         }

@@ -1,4 +1,4 @@
-//! Gradients of NeRF: of its operations one by one, and of the whole training loss with respect to every parameter.
+//! Gradients of NeRF: its operations one by one, and the whole training loss by every parameter.
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -18,12 +18,12 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 #[test]
-fn every_operation_of_nerf_passes_every_check() {
+fn nerf_operations_pass_all_checks() {
     let failures: Vec<_> = catalogue().iter().filter_map(|entry| check_op(&Check::default(), entry).err()).collect();
     assert!(failures.is_empty(), "{}", failures.join("\n"));
 }
 
-/// The names that the operations in a folder of sources give themselves.
+/// The names of the operations in a folder of sources.
 fn operations_in(folder: &Path, names: &mut BTreeSet<String>) {
     for entry in std::fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
@@ -41,7 +41,7 @@ fn operations_in(folder: &Path, names: &mut BTreeSet<String>) {
 }
 
 #[test]
-fn no_operation_of_nerf_is_missing() {
+fn nerf_operations_are_all_in_the_catalogue() {
     let known: BTreeSet<_> = catalogue().iter().map(|entry| entry.name.to_string()).collect();
     let mut written = BTreeSet::new();
     operations_in(&Path::new(env!("CARGO_MANIFEST_DIR")).join("nerf/src"), &mut written);
@@ -49,7 +49,7 @@ fn no_operation_of_nerf_is_missing() {
     assert_eq!(written, known, "operations in the sources and in the catalogue");
 }
 
-/// The training loss at fixed samples: what a step differentiates, as a function of the parameters alone.
+/// The training loss at fixed samples, as a function of the parameters.
 struct Loss<T: Scalar> {
     model: Model<T>,
     samples: Vec<Samples<T>>,
@@ -58,9 +58,9 @@ struct Loss<T: Scalar> {
 }
 
 impl Loss<f32> {
-    /// The loss of a fresh model on rays towards the embedded scene.
+    /// The loss of a new model on rays towards the embedded scene.
     fn new(config: Config, rays: usize, seed: u64) -> Self {
-        // A cube of +-1: positions then need no scaling, and both precisions encode the very same numbers. The highest
+        // A cube of +-1 needs no scaling of positions, so both precisions encode the same numbers. The highest
         // frequency would amplify the rounding of a scaled position 1600 times.
         let [low, high] = Scene::bulldozer().bounds().map(|corner| corner.signum());
         let extent = SceneBox::new([low, high], [2.0, 6.0]);
@@ -73,7 +73,7 @@ impl Loss<f32> {
             batch.push(&ray, clip_near_far(&ray, extent.bounds, extent.near_far));
         }
         let model = Model::new(config, extent, seed).unwrap();
-        // So many binary digits that positions are the same in both precisions.
+        // Few enough binary digits that positions are equal in both precisions.
         let short = |x: &Tensor<f32>| Tensor::from_fn(x.shape(), |i| (x.as_slice()[i] * 512.0).round() / 512.0);
         let shorten = |samples: Samples<f32>| Samples {
             origins: short(&samples.origins),
@@ -117,7 +117,7 @@ impl<T: Scalar> Loss<T> {
     }
 }
 
-/// Two tiny networks that have every part of the classic one.
+/// Two tiny networks with all parts of the classic field.
 fn tiny() -> Config {
     let field = ClassicConfig {
         depth: 3,
@@ -131,7 +131,7 @@ fn tiny() -> Config {
     hierarchical(field, 4, 3)
 }
 
-/// A field that is also its own proposal, with few samples.
+/// Hierarchical sampling with a field that is also its own proposal, and few samples.
 fn hierarchical(field: ClassicConfig, coarse: usize, fine: usize) -> Config {
     let sampler = HierarchicalConfig { proposal: field.clone(), coarse, fine, ..HierarchicalConfig::default() };
     let (field, sampler) = (FieldConfig::new(field), SamplerConfig::new(sampler));
@@ -140,8 +140,8 @@ fn hierarchical(field: ClassicConfig, coarse: usize, fine: usize) -> Config {
 
 #[test]
 fn training_loss_derivatives_match_differences() {
-    // Between two kinks of its ReLUs the loss is smooth. A step of 1e-6 rarely meets a kink, and costs the differences
-    // about ten of their sixteen digits; the seed is one of those that meet none.
+    // The loss is smooth between two kinks of its ReLUs. A step of 1e-6 rarely meets a kink, and costs the differences
+    // about ten of their sixteen digits. This seed meets none.
     let loss = Loss::new(tiny(), 3, 1).double();
     let check = Check { step: 1e-6, tolerance: 1e-8, ..Check::default() };
     let report = check_function(&check, loss.model.params.values(), |vars| loss.at_vars(vars));
@@ -151,7 +151,7 @@ fn training_loss_derivatives_match_differences() {
 }
 
 #[test]
-fn so_has_the_loss_of_the_instant_field() {
+fn instant_loss_derivatives_match_differences() {
     let mut config = Config::preset(Preset::Instant);
     if let Some(field) = config.field.get_mut::<InstantConfig>() {
         field.grid = HashGridConfig { levels: 2, features: 2, log2_table: 6, coarsest: 3, finest: 8 };
@@ -161,7 +161,7 @@ fn so_has_the_loss_of_the_instant_field() {
         sampler.step = 0.1;
     }
     let mut loss = Loss::new(config, 3, 1).double();
-    // Features of the size that training gives them, so that every gradient is well above rounding.
+    // Features of the size after training, so that every gradient is well above rounding.
     let table = loss.model.params.find("field.table").unwrap();
     loss.model.params.get_mut(table).as_mut_slice().iter_mut().for_each(|x| *x *= 1e4);
     let check = Check { step: 1e-6, tolerance: 1e-8, ..Check::default() };
@@ -171,7 +171,7 @@ fn so_has_the_loss_of_the_instant_field() {
 }
 
 #[test]
-fn so_has_the_loss_of_the_voxel_field() {
+fn voxel_loss_derivatives_match_differences() {
     for loss in [LossKind::Mse, LossKind::Huber { delta: 0.2 }] {
         let mut config = Config { loss, ..Config::preset(Preset::Voxel) };
         config.field = FieldConfig::new(VoxelConfig { resolution: 3, direction_degree: 2 });
@@ -179,7 +179,7 @@ fn so_has_the_loss_of_the_voxel_field() {
             sampler.step = 0.1;
         }
         let mut loss = Loss::new(config, 3, 1).double();
-        // Coefficients of the size that training gives them.
+        // Coefficients of the size after training.
         let table = loss.model.params.find("field.table").unwrap();
         loss.model.params.get_mut(table).as_mut_slice().iter_mut().for_each(|x| *x *= 1e4);
         let check = Check { step: 1e-5, tolerance: 1e-8, ..Check::default() };
@@ -190,7 +190,7 @@ fn so_has_the_loss_of_the_voxel_field() {
     }
 }
 
-/// A direction of length 1 in the space of all parameters.
+/// A random unit direction in the space of all parameters.
 fn unit_direction(params: &[Tensor<f64>], rng: &mut StdRng) -> Vec<Tensor<f64>> {
     let mut direction: Vec<_> =
         params.iter().map(|x| Tensor::from_fn(x.shape(), |_| rng.random_range(-1.0..1.0))).collect();
@@ -206,7 +206,7 @@ fn along(params: &[Tensor<f64>], direction: &[Tensor<f64>], h: f64) -> Vec<Tenso
     params.iter().zip(direction).map(pair).collect()
 }
 
-/// A difference across the kink of a ReLU is none: it counts at the step at which it is nearest. A wrong derivative is wrong
+/// A difference across the kink of a ReLU is invalid, so the best of several steps counts. A wrong derivative is wrong
 /// at every step.
 #[test]
 fn deep_relu_network_passes_in_twenty_directions() {
@@ -224,7 +224,7 @@ fn deep_relu_network_passes_in_twenty_directions() {
             let products = grads.iter().zip(&direction).flat_map(|(g, d)| g.as_slice().iter().zip(d.as_slice()));
             let analytic: f64 = products.map(|(g, d)| g * d).sum();
             let numeric = |step: f64| (moved(step) - moved(-step)) / (2.0 * step);
-            // A unit vector without a pattern lies along the gradient by this much.
+            // The expected component of a random unit vector along the gradient.
             let scale = norm / count.sqrt();
             let errors = [1e-4, 1e-5, 1e-6].map(|step| (numeric(step) - analytic).abs() / scale);
             errors.into_iter().reduce(Real::minimum).unwrap()
@@ -256,8 +256,7 @@ fn f32_gradients_agree_with_f64() {
             errors.push(pairs.map(|(single, double)| relative_error(&single, &double)).collect());
             names = single.model.params.iter().map(|(name, _)| name.to_string()).collect();
         }
-        // The median, because now and then a unit sits so near the kink of its ReLU that it is on in one precision and
-        // off in the other.
+        // The median: sometimes a unit is so close to the kink of its ReLU that the precisions disagree on it.
         for (i, name) in names.iter().enumerate() {
             let mut errors: Vec<_> = errors.iter().map(|errors| errors[i]).collect();
             errors.sort_by(f64::total_cmp);
@@ -267,7 +266,7 @@ fn f32_gradients_agree_with_f64() {
     }
 }
 
-/// Value and gradients of a fused operation and of the same function out of plain operations, for the same inputs.
+/// Value and gradients of a fused operation and of its plain reference, for the same inputs.
 fn both_routes<T: Scalar>(
     inputs: &[Tensor<f64>],
     fused: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
@@ -287,7 +286,7 @@ fn both_routes<T: Scalar>(
 fn fused_operations_agree<T: Scalar>(tolerance: f64) {
     let mut rng = StdRng::seed_from_u64(2);
     let mut random = |shape: &[usize], from: f64, to: f64| {
-        // Numbers that f32 holds, so that both precisions see the same.
+        // Numbers that f32 can hold, so that both precisions get the same.
         Tensor::from_fn(shape, |_| f64::from(rng.random_range(from..to) as f32))
     };
     let segments = Segments::new([0, 40, 40, 41, 150]);

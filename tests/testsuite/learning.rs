@@ -1,4 +1,4 @@
-//! End to end: photographs and cameras go in, and views that were held out come out.
+//! End to end: trains on images and cameras, and evaluates held-out views.
 
 use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
@@ -31,7 +31,7 @@ fn config() -> Config {
     Config { field, sampler, ..Config::preset(Preset::Small) }
 }
 
-/// A small hash grid, marched with few samples.
+/// A small marched hash grid with few samples.
 fn instant() -> Config {
     let mut config = Config::preset(Preset::Instant);
     if let Some(field) = config.field.get_mut::<InstantConfig>() {
@@ -45,13 +45,13 @@ fn instant() -> Config {
     config
 }
 
-/// A coarse grid of voxels, marched with few samples.
+/// A coarse marched voxel grid with few samples.
 fn voxel() -> Config {
     let field = FieldConfig::new(VoxelConfig { resolution: 32, direction_degree: 2 });
     Config { field, sampler: instant().sampler, ..Config::preset(Preset::Voxel) }
 }
 
-/// The mean PSNR, in dB, of held-out views after so many steps on `train`, and that of blank pictures.
+/// The mean PSNR, in dB, of held-out views after `steps` on `train`, and that of blank images.
 fn learn(config: Config, steps: u64, train: Dataset, test: &Dataset) -> [f64; 2] {
     let white = [1.0; 3];
     let mut trainer = Trainer::new(config, Arc::new(train)).unwrap();
@@ -69,8 +69,8 @@ fn learn(config: Config, steps: u64, train: Dataset, test: &Dataset) -> [f64; 2]
 }
 
 #[test]
-fn the_embedded_scene_is_learnt_in_seconds() {
-    // Any field is to work with any sampler.
+fn embedded_scene_is_learned_in_seconds() {
+    // Any field works with any sampler.
     let marched = config().with_skip(Skip::Fast);
     let huber = Config { loss: Loss::Huber { delta: 0.1 }, ..instant() };
     let configs = [
@@ -89,7 +89,7 @@ fn the_embedded_scene_is_learnt_in_seconds() {
 }
 
 #[test]
-fn lego_is_learnt_in_seconds() {
+fn lego_is_learned_in_seconds() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/lego");
     if !folder.is_dir() {
         println!("skipped: there is no folder {}", folder.display());

@@ -1,4 +1,4 @@
-//! What the crates promise together: gradients, stability, training from end to end.
+//! Tests across crates: gradients, stability, training from end to end.
 
 mod determinism;
 mod doctor;

@@ -1,4 +1,4 @@
-//! The parts of a model, put together from outside of the crate: fields, samplers and terms of one's own and of others.
+//! Components of a model, combined through the public interface: custom and built-in fields, samplers and loss terms.
 
 use raygrad::nerf::camera::stratified;
 use raygrad::nerf::dataset::{Dataset, Split};
@@ -37,14 +37,15 @@ fn instant() -> Config {
     config
 }
 
-/// So many steps; the first and the mean of the last losses.
+/// Takes `steps` steps; returns the first loss and the mean of the last ones.
 fn train(trainer: &mut Trainer, steps: u32) -> [f64; 2] {
     let losses: Vec<f64> = (0..steps).map(|i| trainer.step(f64::from(i) / f64::from(steps)).loss).collect();
     let last = &losses[losses.len() - 5..];
     [losses[0], last.iter().sum::<f64>() / 5.0]
 }
 
-/// Saves a model, loads it by its configuration as text, and sees whether both show the same; gives the picture.
+/// Saves a model, loads it with its serialised configuration and checks that both render the same image, which it
+/// returns.
 fn comes_back(model: &Model<f32>) -> Vec<f32> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.safetensors");
@@ -77,7 +78,7 @@ fn proposals_are_trained_rendered_and_stored() {
     }
     assert!(names.len() == 6 && trainer.stats().density_queries > trainer.stats().color_queries);
     trainer.model.finish();
-    // Proposals are where the field is: most of the last samples of a ray that meets something lie where weights are.
+    // Proposals follow the field: most of the last samples of a ray that hits something are near its weights.
     let model = &trainer.model;
     let picture = comes_back(model);
     assert!(picture.iter().all(|x| x.is_finite()) && picture.iter().any(|&x| x < 0.5));
@@ -115,7 +116,7 @@ fn unbounded_scene_beyond_the_box_is_trained() {
     assert!(last < 0.5 * first, "{first} to {last}");
     trainer.model.finish();
     comes_back(&trainer.model);
-    // Rays that miss the box meet something all the same.
+    // Rays that miss the box see something too.
     let camera = &DATA.frames[1].camera;
     let seen = trainer.model.render(camera, [1.0; 3]).opacity;
     let misses = |i: &usize| {
@@ -126,8 +127,7 @@ fn unbounded_scene_beyond_the_box_is_trained() {
     assert!(beyond.len() > 50 && beyond.iter().filter(|&&x| x > 0.5).count() > 10, "{}", beyond.len());
 }
 
-/// A field of this file: one small network on bare coordinates. It counts how often colours were asked for with and without
-/// photographs.
+/// A custom field: one small network on bare coordinates. It counts colour queries with and without image indices.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct BareConfig {
@@ -198,7 +198,7 @@ fn custom_field_is_trained_rendered_saved_and_loaded() {
     assert!(ASKED[0].load(Relaxed) > 0, "views do not");
 }
 
-/// A model of the instant kind in double precision with something in it, and rays through it.
+/// An instant model in double precision that is not empty, and rays through it.
 fn busy() -> (Model<f64>, Rays<f64>) {
     let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.5, 4.0]);
     let mut model = Model::<f64>::new(instant(), extent, 5).unwrap();
@@ -239,7 +239,7 @@ fn two_passes_equal_one_with_every_quadrature() {
             let largest = a.as_slice().iter().map(|x| x.abs()).fold(0.0, raygrad::Real::maximum);
             assert!(worst <= 1e-12 * largest.max(1e-3), "{rule}: {worst}");
         }
-        // And with a limit that leaves something out.
+        // And with a limit that drops samples.
         let some = rule.render(&query, &steps, 0.8);
         assert!(some.visible < one.visible, "{rule}");
         for (a, b) in color(&one).into_iter().zip(color(&some)) {
@@ -307,13 +307,13 @@ fn normals_are_unit_vectors_down_the_density() {
         assert!((normal.length() - 1.0).abs() < 1e-6, "{normal}");
         assert!(normal.distance(-slope.normalize()) < 1e-4, "{normal} {slope}");
     }
-    // They have gradients of their own.
+    // They are differentiable.
     let summed = seen.accumulate(&normals).square().sum();
     assert!(summed.grad(&[&seen.positions])[0].is_finite());
 }
 
 #[test]
-fn densities_are_measured_in_the_unit_of_the_box() {
+fn densities_are_in_the_unit_of_the_box() {
     let density = |size: f64, preset: Preset| {
         let mut config = Config::preset(preset);
         config.field = if preset == Preset::Instant { instant().field } else { config.field };
@@ -328,13 +328,13 @@ fn densities_are_measured_in_the_unit_of_the_box() {
         let [one, hundred] = [1.5, 150.0].map(|size| density(size, preset));
         assert!((one / hundred - 100.0).abs() < 1e-6, "{preset}: {one} {hundred}");
     }
-    // A file from before there was a choice means scene units.
+    // Files of earlier versions, without the field, use scene units.
     let old = r#"{"bounds": [[-150, -150, -150], [150, 150, 150]], "span": [2, 6]}"#;
     assert_eq!(serde_json::from_str::<SceneBox>(old).unwrap().unit, 1.0);
 }
 
 #[test]
-fn terms_of_a_file_take_part_in_training() {
+fn loss_terms_of_a_file_count_in_training() {
     let bare = instant();
     let mut value = serde_json::to_value(&bare).unwrap();
     value["loss_terms"] =
@@ -362,17 +362,17 @@ fn terms_of_a_file_take_part_in_training() {
 fn time_budget_follows_the_given_clock() {
     let clock = Arc::new(AtomicU64::new(0));
     let tick = clock.clone();
-    // Every look at the clock takes a second.
+    // Each reading of the clock takes a second.
     let now = move || Duration::from_secs(tick.fetch_add(1, Relaxed));
     let extent = SceneBox::new(DATA.bounds, [DATA.near, DATA.far]);
     let mut trainer = Trainer::with_clock(instant(), DATA.clone(), extent, now).unwrap();
     let mut seen = vec![];
     trainer.run(Budget::Time(Duration::from_secs(11)), |trainer| {
-        clock.fetch_add(1000, Relaxed); // an observer that takes its time
+        clock.fetch_add(1000, Relaxed); // an observer that takes time
         seen.push(trainer.stats().train_seconds);
         ControlFlow::Continue(())
     });
-    // One second before the first step, for what is learned from the photographs, and one for each step.
+    // One second for the preparation of the sampler, and one per step.
     assert_eq!(seen, (2..=11).map(f64::from).collect::<Vec<_>>());
 }
 
@@ -387,7 +387,7 @@ fn skip_switches_of_earlier_versions_are_read() {
     let fast = Skipping { grid: true, carving: 3, pruning: 0.05, early_stop_eps: 1e-3, colors: 2e-3 };
     let lossless = Skipping { pruning: 0.005, early_stop_eps: 1e-4, colors: 1e-4, ..fast };
     assert_eq!([Skip::Fast, Skip::NearLossless].map(Skipping::from), [fast, lossless]);
-    // Views leave out what they are told to; what training left out they cannot put back.
+    // Renders skip as configured; cells that training skipped stay empty.
     let mut trainer = Trainer::new(instant(), DATA.clone()).unwrap();
     train(&mut trainer, 60);
     let model = &mut trainer.model;

@@ -1,5 +1,5 @@
-//! Pictures against what is known exactly: a ray-traced scene from cameras that no symmetry helps, and integrals in closed
-//! form through the path that every view takes.
+//! Images compared with exact values: a ray-traced scene from cameras without symmetry, and closed-form integrals
+//! through the path of all renders.
 
 use raygrad::Params;
 use raygrad::nerf::analytic::{AnalyticField, AnalyticScene, Layer, Layers, scenes};
@@ -19,7 +19,7 @@ use raygrad_scenes::{DISTANCE, Landscape, Scene, View, walk_cameras};
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// A camera that is wider than high, with pixels that are not square, its principal point off the centre, and rolled.
+/// A camera with a wide image, non-square pixels, an off-centre principal point and a roll.
 fn camera(number: usize) -> Camera {
     let angle = 0.4 + 2.4 * number as f64;
     let height = 0.15 + 0.7 * (number as f64 * 0.618).fract();
@@ -30,14 +30,14 @@ fn camera(number: usize) -> Camera {
     Camera { width: 60, height: 44, focal: [110.0, 99.0], centre: [33.0, 19.0], lens: Lens::Pinhole, pose }
 }
 
-/// Where a golden file lies.
+/// The path of a golden file.
 fn golden(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/reference").join(name)
 }
 
-/// `reference/metrics.py` asked scikit-image.
+/// `reference/metrics.py` computed the expected values with scikit-image.
 #[test]
-fn psnr_and_ssim_are_those_of_scikit_image() {
+fn psnr_and_ssim_equal_scikit_image() {
     let values: serde_json::Value = serde_json::from_slice(&std::fs::read(golden("metrics.json")).unwrap()).unwrap();
     let values = values.as_object().unwrap();
     assert_eq!(values.len(), 10);
@@ -51,7 +51,7 @@ fn psnr_and_ssim_are_those_of_scikit_image() {
     }
 }
 
-/// All pictures that are kept: of the bulldozer alone, and of the landscape around it.
+/// All golden images: of the bulldozer alone, and of the landscape around it.
 fn all_pictures() -> Vec<(&'static str, Image)> {
     let mut all = Vec::from(pictures(&Scene::bulldozer().render(&camera(1), 9)));
     all.push(("golden-landscape.png", Landscape::new().render(&walk_cameras(Split::Test, 64)[3], 9)));
@@ -71,10 +71,9 @@ fn pictures(view: &View) -> [(&'static str, Image); 3] {
     ]
 }
 
-/// Everything goes through one [`Camera`], so that a mistake of it would show nowhere but in pictures that were looked at
-/// once and kept.
+/// All renderers share one [`Camera`], so its errors would show only in images that were inspected once and stored.
 #[test]
-fn scene_looks_the_same_from_asymmetric_camera() {
+fn scene_equals_golden_pictures() {
     for (name, image) in all_pictures() {
         let kept = Image::open(golden(name)).unwrap();
         assert_eq!([kept.width, kept.height], [image.width, image.height], "{name}");
@@ -92,9 +91,9 @@ fn write_golden_pictures() {
     }
 }
 
-/// A point of the scene is seen where the formula of a pinhole puts it, written out.
+/// The pinhole formula, written out, gives the pixel of a scene point.
 #[test]
-fn points_project_as_the_pinhole_formula_says() {
+fn points_project_by_the_pinhole_formula() {
     for number in 0..5 {
         let camera = camera(number);
         for (column, row) in [(0, 0), (59, 3), (17, 43), (33, 19)] {
@@ -110,7 +109,7 @@ fn points_project_as_the_pinhole_formula_says() {
     }
 }
 
-/// The same picture turned half around and mirrored: what mistakes of signs and of axes would show.
+/// The image rotated and mirrored: the results of wrong signs and swapped axes.
 fn mistaken(image: &Image) -> [Image; 3] {
     let Image { width, height, channels, .. } = *image;
     let from = |place: &dyn Fn(usize, usize) -> [usize; 2]| {
@@ -126,8 +125,8 @@ fn mistaken(image: &Image) -> [Image; 3] {
     [from(&|x, y| [width - 1 - x, y]), from(&|x, y| [x, height - 1 - y]), from(&|x, y| [width - 1 - x, height - 1 - y])]
 }
 
-/// The median angle in degrees between a model's normals and those of the scene, where it is even: where the neighbours of
-/// a pixel have its normal.
+/// The median angle in degrees between a model's normals and those of the scene, at pixels whose neighbours have the
+/// same normal.
 fn normals_apart(model: &Model<f32>, camera: &Camera, truth: &Image) -> f64 {
     let tape = Tape::new();
     let params = model.params.bind_constant(&tape);
@@ -186,7 +185,7 @@ fn learned_scene_has_true_colour_depth_and_normals() {
         trainer.step(f64::from(i) / 800.0);
     }
     trainer.model.finish();
-    // The first two were not trained on.
+    // The first two are not training cameras.
     for number in 0..2 {
         let camera = camera(number);
         let truth = scene.render(&camera, 9);
@@ -217,9 +216,9 @@ fn learned_scene_has_true_colour_depth_and_normals() {
     }
 }
 
-/// A wall across the ray: what is left out of it is made up for, in its distance too.
+/// A wall across the ray: early termination is compensated for, also in depth.
 #[test]
-fn what_ends_early_is_as_far_away_as_what_does_not() {
+fn early_termination_keeps_the_depth() {
     let wall = Layer { from: 3.0, to: 3.5, sigma: 200.0, color: [0.5, 0.0] };
     let layers = Layers::new(std::slice::from_ref(&wall));
     let exact = layers.exact(4.0, 1.0);
@@ -233,7 +232,7 @@ fn what_ends_early_is_as_far_away_as_what_does_not() {
     assert!((seen.color.data[0] - 0.5).abs() < 1e-5, "{:?}", seen.color.data);
 }
 
-/// A model that is a medium of which everything is known, marched with steps of 1/400 of the box.
+/// A model that is an analytic medium, marched with steps of 1/400 of the box.
 fn medium(scene: &AnalyticScene, rule: Quadrature, skip: Skip) -> Model<f32> {
     let occupancy = OccupancyConfig { resolution: 32, cascades: 1, skip: skip.into() };
     let marching = MarchingConfig { occupancy, quadrature: rule, view_step: 1.0 / 400.0, ..MarchingConfig::default() };
@@ -247,7 +246,7 @@ fn medium(scene: &AnalyticScene, rule: Quadrature, skip: Skip) -> Model<f32> {
 }
 
 #[test]
-fn views_of_known_media_are_exact_within_limits() {
+fn renders_of_analytic_media_are_exact() {
     let rules = [
         (Quadrature::Left, 6e-3),
         (Quadrature::Midpoint, 4e-3),
@@ -256,7 +255,7 @@ fn views_of_known_media_are_exact_within_limits() {
         (Quadrature::Adaptive { tolerance: 1e-4 }, 1e-3),
     ];
     for scene in scenes() {
-        // The ray is that of the pixel in column 3 and row 1 of a picture that is wider than high.
+        // The ray is that of the pixel in column 3 and row 1 of a wide image.
         let pose = Camera::look_at(scene.ray.origin, scene.ray.at(1.0), DVec3::Y);
         let camera = Camera { width: 5, height: 3, focal: [40.0, 30.0], centre: [3.5, 1.5], lens: Lens::Pinhole, pose };
         assert!(camera.pixel_ray(3, 1).direction.distance(scene.ray.direction) < 1e-12);

@@ -1,4 +1,4 @@
-//! Cameras that are corrected while a scene is trained.
+//! Camera refinement during training.
 
 use raygrad::Real;
 use raygrad::Schedule;
@@ -24,7 +24,7 @@ fn instant() -> Config {
     config
 }
 
-/// Photographs of the embedded scene through that lens.
+/// Images of the embedded scene through this lens.
 fn photographs(count: usize, size: usize, lens: Lens) -> Dataset {
     let mut data = embedded(Split::Train, 8);
     data.frames.truncate(count);
@@ -36,7 +36,7 @@ fn photographs(count: usize, size: usize, lens: Lens) -> Dataset {
     data
 }
 
-/// The same with cameras that are off by so many degrees, by a share of the scene's size, and by a factor of the focal
+/// The same with cameras disturbed by an angle in degrees, by a share of the scene's size, and by a factor of the focal
 /// length.
 fn disturbed(data: &Dataset, degrees: f64, share: f64, factor: f64) -> Dataset {
     let mut wrong = data.clone();
@@ -58,8 +58,8 @@ fn train(trainer: &mut Trainer, steps: u32) {
     }
 }
 
-/// The mean error of the cameras that were found: degrees, and a share of the scene's size, after the similarity that
-/// nobody can know.
+/// The mean error of the refined cameras: degrees, and a share of the scene's size, after the similarity that cannot be
+/// determined.
 fn errors(model: &Model<f32>, right: &Dataset, wrong: &Dataset) -> [f64; 2] {
     let found: Vec<Camera> =
         wrong.frames.iter().enumerate().map(|(i, frame)| model.learned_camera(i, &frame.camera)).collect();
@@ -77,7 +77,7 @@ fn errors(model: &Model<f32>, right: &Dataset, wrong: &Dataset) -> [f64; 2] {
     sum.map(|x| x / found.len() as f64)
 }
 
-/// A field that was trained with the right cameras and rests, and the wrong cameras that move.
+/// A frozen field that was trained with the right cameras, and wrong cameras that are refined.
 fn before_a_known_scene(config: Config, right: &Dataset, wrong: &Dataset) -> Trainer {
     let is_camera = |name: &str| ["poses", "focal", "lens", "exposure", "vignetting"].contains(&name);
     let mut known = Trainer::new(config.clone(), Arc::new(right.clone())).unwrap();
@@ -92,7 +92,7 @@ fn before_a_known_scene(config: Config, right: &Dataset, wrong: &Dataset) -> Tra
 }
 
 #[test]
-fn poses_are_found_in_a_scene_that_is_known() {
+fn refinement_finds_poses_in_a_known_scene() {
     let right = photographs(24, 48, Lens::Pinhole);
     let wrong = disturbed(&right, 2.0, 0.02, 1.0);
     let mut config = instant().with_refined(&[RefinedParam::Poses]);
@@ -108,7 +108,7 @@ fn poses_are_found_in_a_scene_that_is_known() {
 }
 
 #[test]
-fn a_focal_length_is_found_in_a_scene_that_is_known() {
+fn refinement_finds_focal_length_in_a_known_scene() {
     let right = photographs(24, 48, Lens::Pinhole);
     let wrong = disturbed(&right, 0.0, 0.0, 1.05);
     let mut config = instant().with_refined(&[RefinedParam::Focal]);
@@ -122,7 +122,7 @@ fn a_focal_length_is_found_in_a_scene_that_is_known() {
 }
 
 #[test]
-fn a_lens_is_found_with_the_focal_length() {
+fn refinement_finds_lens_and_focal_length() {
     let glass = Lens::Brown { k: [-0.2, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
     let right = photographs(16, 48, glass);
     let mut wrong = disturbed(&right, 0.0, 0.0, 1.03);
@@ -133,7 +133,7 @@ fn a_lens_is_found_with_the_focal_length() {
     let mut trainer = before_a_known_scene(config, &right, &wrong);
     train(&mut trainer, 400);
     let (found, right) = (trainer.model.learned_camera(2, &wrong.frames[2].camera), &right.frames[2].camera);
-    // How far pixels are from where they belong, at most, in pixels.
+    // The largest distance of pixels from their right positions, in pixels.
     let apart = |camera: &Camera| {
         let places =
             (0..49).map(|i| right.ray(4.0 + f64::from(i % 7) * 40.0 / 6.0, 4.0 + f64::from(i / 7) * 40.0 / 6.0));
@@ -151,7 +151,7 @@ fn a_lens_is_found_with_the_focal_length() {
 }
 
 #[test]
-fn what_was_found_of_cameras_is_stored_with_the_model() {
+fn refined_cameras_are_stored_with_the_model() {
     let data = photographs(6, 16, Lens::Pinhole);
     let config = instant().with_refined(&[RefinedParam::Poses, RefinedParam::Focal, RefinedParam::Lens]);
     let mut trainer = Trainer::new(config.clone(), Arc::new(data.clone())).unwrap();
@@ -167,7 +167,7 @@ fn what_was_found_of_cameras_is_stored_with_the_model() {
     assert_eq!(read.cameras().len(), 6);
     let again = read.cast::<f64>().unwrap().learned_camera(4, camera);
     assert_eq!(again, one);
-    // A configuration from before cameras could be corrected still loads.
+    // A configuration of an earlier version, without camera refinement, still loads.
     let mut value = serde_json::to_value(instant()).unwrap();
     value.as_object_mut().unwrap().remove("camera_optimizer").unwrap();
     assert_eq!(serde_json::from_value::<Config>(value).unwrap(), instant());
@@ -176,7 +176,7 @@ fn what_was_found_of_cameras_is_stored_with_the_model() {
 }
 
 #[test]
-fn detail_comes_in_from_coarse_to_fine() {
+fn refinement_enables_detail_from_coarse_to_fine() {
     let data = Arc::new(photographs(6, 16, Lens::Pinhole));
     let config = instant().with_refined(&[RefinedParam::Poses]);
     let mut trainer = Trainer::new(config, data).unwrap();
@@ -185,7 +185,7 @@ fn detail_comes_in_from_coarse_to_fine() {
     let untouched = rows(&trainer);
     trainer.step(0.01);
     let first = rows(&trainer);
-    // The three coarsest of six levels: the last rows belong to the finest.
+    // The three coarsest of six levels; the last rows belong to the finest.
     let moved = |a: &[f32], b: &[f32]| a.iter().zip(b).rposition(|(a, b)| a != b).unwrap() as f64 / a.len() as f64;
     let early = moved(&untouched, &first);
     trainer.step(0.5);
@@ -201,10 +201,10 @@ fn detail_comes_in_from_coarse_to_fine() {
 }
 
 #[test]
-fn exposure_and_vignetting_of_known_scene_are_found() {
+fn exposure_model_finds_exposure_and_vignetting() {
     let right = photographs(24, 32, Lens::Pinhole);
     let mut seen = right.clone();
-    // From .55 to 1 times as bright, so that nothing is cut off, the red more than the blue; and corners at half of the
+    // From 0.55 to 1 times as bright, so that nothing saturates, and red more than blue. The corners have half of the
     // brightness of the middle.
     let exposure = |i: usize| {
         let e = 0.3 * ((2.0 * i as f64 + 0.3).sin() - 1.0);
@@ -234,12 +234,12 @@ fn exposure_and_vignetting_of_known_scene_are_found() {
     }
     let vignetting = numbers("vignetting");
     println!("vignetting {vignetting:?}");
-    // The bulldozer does not reach the corners.
+    // The bulldozer does not extend to the corners.
     for s in [0.1_f32, 0.2, 0.3] {
         let falloff = s * (vignetting[0] + s * (vignetting[1] + s * vignetting[2]));
         assert!((falloff + 0.7 * s).abs() < 0.03, "{s}: {falloff}");
     }
-    // A view like a photograph is one; a view of one's own is as bright as all on average, to its corners.
+    // A render for a training image equals it. A render without an image has the mean brightness, also in its corners.
     let mut model = model.clone();
     model.finish();
     let mut error = |look: Option<u32>, vignetted: bool, truth: &Dataset| {
@@ -269,11 +269,11 @@ fn fit_poses_finds_held_out_cameras_alone() {
     let model = &trainer.model;
     let before = model.params.values().to_vec();
     let mut wrong = disturbed(&held_out, 1.0, 0.01, 1.0);
-    // The scene lies where the model has it.
+    // The scene transform is that of the model.
     wrong.bounds = wrong.bounds.map(|corner| 1.5 * corner);
     let found = fitted_cameras(model, wrong.clone()).unwrap();
     assert_eq!(model.params.values(), before);
-    // By how many pixels places of the scene are off, in the mean: a turn and a step to the side look alike.
+    // The mean error of scene points in pixels, since a rotation and a sideways step look alike.
     let places: Vec<DVec3> =
         (0..8_u8).map(|i| DVec3::from([1, 2, 4].map(|bit| if i & bit == 0 { -0.6 } else { 0.6 }))).collect();
     let off = |cameras: &[Camera]| {

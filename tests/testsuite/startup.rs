@@ -1,4 +1,5 @@
-//! Dead starts: a ReLU density can be 0 everywhere from the first step, or soon, and such a network never learns.
+//! Dead networks: a ReLU density may be 0 everywhere from the first step or soon after, and such a network never
+//! learns.
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -9,7 +10,7 @@ use raygrad::{Tape, Tensor};
 use raygrad_scenes::embedded;
 use std::sync::Arc;
 
-/// Networks as deep as the paper's and so narrow that many seeds are dead.
+/// Networks as deep as the paper's, and so narrow that many seeds are dead.
 fn narrow(seed: u64) -> Config {
     let field = ClassicConfig { width: 4, view_width: 4, position_levels: 2, ..ClassicConfig::paper() };
     let sampler = HierarchicalConfig {
@@ -28,7 +29,7 @@ fn data() -> Arc<Dataset> {
     Arc::new(embedded(Split::Val, 8))
 }
 
-/// The least share, over both fields, of random points in the box that have density.
+/// The least share, over both fields, of random points in the box with density.
 fn density_share(model: &Model<f32>) -> f64 {
     let mut rng = StdRng::seed_from_u64(1);
     let [low, high] = model.scene_box.bounds.map(|corner| corner.to_array());
@@ -43,7 +44,7 @@ fn density_share(model: &Model<f32>) -> f64 {
 }
 
 #[test]
-fn of_a_hundred_seeds_none_starts_dead() {
+fn none_of_100_seeds_starts_dead() {
     let data = data();
     let extent = SceneBox::new(data.bounds, [data.near, data.far]);
     let (mut dead, mut passed_over) = (0, 0);
@@ -60,7 +61,7 @@ fn of_a_hundred_seeds_none_starts_dead() {
     assert!(passed_over >= dead);
 }
 
-/// Takes away all density, as a few unlucky steps can.
+/// Removes all density, as a few unlucky steps can.
 fn collapse(trainer: &mut Trainer) {
     let biases: Vec<_> = trainer.model.params.iter().map(|(name, _)| name.ends_with("density.bias")).collect();
     for (value, _) in trainer.model.params.values_mut().iter_mut().zip(biases).filter(|(_, is_bias)| *is_bias) {
@@ -69,7 +70,7 @@ fn collapse(trainer: &mut Trainer) {
     assert_eq!(density_share(&trainer.model), 0.0);
 }
 
-/// How often the run begins again within so many steps.
+/// The number of restarts within some steps.
 fn restarts_within(trainer: &mut Trainer, steps: u32) -> u32 {
     let before = trainer.stats().restarts;
     for _ in 0..steps {
@@ -79,9 +80,9 @@ fn restarts_within(trainer: &mut Trainer, steps: u32) -> u32 {
 }
 
 #[test]
-fn a_collapsed_run_begins_again_with_another_seed() {
+fn collapsed_run_restarts_with_another_seed() {
     let data = data();
-    // Seeds that were taken at once, and seeds before which others were passed over: those do not count as collapses.
+    // Seeds accepted at once, and seeds after rejected ones, which do not count as collapses.
     let mut passed_over = 0;
     for seed in 0..25 {
         let mut trainer = Trainer::new(narrow(seed), data.clone()).unwrap();
@@ -96,7 +97,7 @@ fn a_collapsed_run_begins_again_with_another_seed() {
 }
 
 #[test]
-fn a_scene_that_stays_empty_does_not_restart_for_ever() {
+fn empty_scene_stops_restarting() {
     let mut trainer = Trainer::new(narrow(0), data()).unwrap();
     let restarts = [(); 5].map(|()| {
         collapse(&mut trainer);
@@ -106,7 +107,7 @@ fn a_scene_that_stays_empty_does_not_restart_for_ever() {
 }
 
 #[test]
-fn a_run_that_learns_is_left_alone() {
+fn learning_run_does_not_restart() {
     let mut config = Config::preset(Preset::Small);
     if let Some(sampler) = config.sampler.get_mut::<HierarchicalConfig>() {
         sampler.batch = 32;

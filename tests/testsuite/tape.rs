@@ -1,4 +1,4 @@
-//! What the tape promises: derivatives of any order, threads that never meet, errors that name the line at fault.
+//! The tape: derivatives of any order, one tape per thread, errors that name the line.
 
 use raygrad::check::{Check, Entry, check_function, check_op};
 use raygrad::{
@@ -19,7 +19,7 @@ fn assert_close(what: &str, got: &[f64], expected: &[f64], tolerance: f64) {
     }
 }
 
-/// The text of the panic that `f` ends in.
+/// The message of the panic that `f` ends in.
 #[track_caller]
 fn panic_of<R>(f: impl FnOnce() -> R) -> String {
     let Err(panic) = catch_unwind(AssertUnwindSafe(f)) else { panic!("nothing panicked") };
@@ -57,16 +57,16 @@ fn hessian_times_vector_of_a_quadratic_form() {
 }
 
 #[test]
-fn a_variable_used_often_gathers_every_share() {
+fn reused_variable_sums_all_shares() {
     let tape = Tape::<f64>::new();
     let x = tape.leaf(vector(&[0.5, -1.0]));
-    // Small integers: the sum 1 + 2 + .. + 100 is exact.
+    // Small integers, so that the sum 1 + 2 + .. + 100 is exact.
     let mut sum = &x * 1.0;
     for k in 2..=100 {
         sum += &x * f64::from(k);
     }
     assert_eq!(sum.sum().grad(&[&x])[0].as_slice(), [5050.0; 2]);
-    // Both factors, a broadcast operand, and the same variable asked for twice.
+    // Both factors, a broadcast operand, and one variable requested twice.
     let y = (&x * &x).sum() + (&x + tape.constant(Tensor::zeros(&[3, 2]))).sum();
     let grads = y.grad(&[&x, &x]);
     assert_eq!(grads[0].as_slice(), [4.0, 1.0], "2 x + 3");
@@ -116,7 +116,7 @@ fn recording_returns_after_a_panic() {
 }
 
 #[test]
-fn a_freed_graph_says_so() {
+fn gradient_of_a_freed_graph_is_an_error() {
     let tape = Tape::new();
     let x = tape.leaf(vector(&[0.5]));
     let y = x.sin().sum();
@@ -150,7 +150,7 @@ fn cleared_tape_gives_same_bits_without_allocating() {
     }
 }
 
-/// The bits of a gradient that passes through products, broadcasts and nonlinearities.
+/// The bits of a gradient through products, broadcasts and nonlinearities.
 fn gradient_bits(salt: usize) -> Vec<u32> {
     let mut tape = Tape::<f32>::new();
     let mut bits = vec![];
@@ -168,7 +168,7 @@ fn gradient_bits(salt: usize) -> Vec<u32> {
 }
 
 #[test]
-fn many_threads_with_a_tape_each_give_the_bits_of_one() {
+fn threads_with_own_tapes_give_equal_bits() {
     for threads in [4, 8] {
         let serial: Vec<_> = (0..threads).map(gradient_bits).collect();
         let parallel: Vec<_> = std::thread::scope(|scope| {
@@ -180,8 +180,7 @@ fn many_threads_with_a_tape_each_give_the_bits_of_one() {
     }
 }
 
-/// A user's operation: y = log of the sum over the last axis of exp x, which stays as an axis of extent 1.
-/// dx = g exp(x - y).
+/// A user's operation: `y = ln sum exp x` over the last axis, which keeps the extent 1. `dx = g exp(x - y)`.
 #[derive(Clone)]
 struct LogSumExp;
 
@@ -218,7 +217,7 @@ impl<T: Scalar> Op<T> for LogSumExp {
 }
 
 #[test]
-fn a_users_operation_is_one_like_any_other() {
+fn custom_operation_passes_all_checks() {
     let entry = Entry::new(LogSumExp).sample(&[&[4, 3]]).sample(&[&[2, 2, 5]]).sample(&[&[1]]).sample(&[&[0, 2]]);
     check_op(&Check::default(), &entry).unwrap();
     let tape = Tape::<f32>::new();
@@ -226,7 +225,7 @@ fn a_users_operation_is_one_like_any_other() {
     assert_eq!(y.value().as_slice(), [1000.0 + 2.0_f32.ln()]);
 }
 
-/// Rematerialisation: keeps only its inputs and runs `f(a, b) = exp(a sin b)` again to differentiate it.
+/// Rematerialisation: keeps only its inputs and evaluates `f(a, b) = exp(a sin b)` again to differentiate it.
 #[derive(Clone)]
 struct Replay;
 
@@ -252,7 +251,7 @@ impl<T: Scalar> Op<T> for Replay {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         if cx.recording() {
-            // New nodes, so that an input which depends on the other keeps to its own share, and a constant has a gradient.
+            // New nodes: an input that depends on the other keeps its own share, and a constant has a gradient.
             let (a, b) = ((cx.x(0) * 1.0).tracked(), (cx.x(1) * 1.0).tracked());
             return Grads::new(Self::run(&a, &b).vjp(cx.g(), &[&a, &b]).into_iter().map(Some));
         }
@@ -264,9 +263,9 @@ impl<T: Scalar> Op<T> for Replay {
 }
 
 #[test]
-fn a_gradient_can_be_taken_inside_a_vjp() {
+fn gradient_inside_a_vjp_is_supported() {
     check_op(&Check::default(), &Entry::new(Replay).sample(&[&[2, 3], &[2, 3]])).unwrap();
-    // One input depends on the other: first and second derivatives are those of the plain expression.
+    // One input depends on the other: first and second derivatives equal those of the plain expression.
     let derivatives = |f: for<'t> fn(&Var<'t, f64>, &Var<'t, f64>) -> Var<'t, f64>| {
         let tape = Tape::new();
         let x = tape.leaf(vector(&[0.3, 0.8]));
@@ -316,7 +315,7 @@ fn shape_errors_name_operation_shapes_and_line() {
 }
 
 #[test]
-fn variables_of_two_tapes_do_not_mix() {
+fn variables_of_two_tapes_panic_together() {
     let (one, two) = (Tape::<f32>::new(), Tape::<f32>::new());
     let (x, y) = (one.leaf(Tensor::ones(&[])), two.leaf(Tensor::ones(&[])));
     assert!(panic_of(|| &x * &y).contains("another tape"));
@@ -325,7 +324,7 @@ fn variables_of_two_tapes_do_not_mix() {
 }
 
 #[test]
-fn the_nan_finder_names_operation_line_and_index() {
+fn nan_finder_names_operation_line_and_index() {
     let tape = Tape::<f64>::new();
     tape.check_finite(true);
     let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, 2.0, -1.0, -3.0]));
@@ -333,7 +332,7 @@ fn the_nan_finder_names_operation_line_and_index() {
     let expected = format!("ln: output is NaN at index [1, 0] (recorded at {}:{}:", file!(), line!() - 1);
     assert!(message.starts_with(&expected), "{message}");
 
-    // The root is finite at 0, its slope is not.
+    // The root is finite at 0; its slope is not.
     let x = tape.leaf(vector(&[4.0, 1.0, 0.0]));
     let root = x.sqrt();
     let line = line!() - 1;
@@ -346,13 +345,13 @@ fn the_nan_finder_names_operation_line_and_index() {
 }
 
 #[test]
-fn the_nan_finder_says_where_a_bad_value_came_in() {
+fn nan_finder_names_the_source_of_a_bad_value() {
     let tape = Tape::<f64>::new();
     tape.check_finite(true);
     let message = panic_of(|| tape.leaf(vector(&[1.0, f64::INFINITY])));
     let expected = format!("leaf: the value is inf at index [1] (recorded at {}:{}:", file!(), line!() - 1);
     assert!(message.starts_with(&expected), "{message}");
-    // A constant is not looked at, but what is computed from it says whose fault it is.
+    // Constants are not checked, but an operation on one names the input.
     let (x, bad) = (tape.leaf(vector(&[1.0, 2.0])), tape.constant(vector(&[f64::NAN, 0.0])));
     let message = panic_of(|| &x + &bad);
     assert!(message.starts_with("add: output (and input 1 was not finite before) is NaN at index [0]"), "{message}");
@@ -365,7 +364,7 @@ fn nan_finder_checks_recorded_and_sparse_gradients() {
     let starts = |message: String, expected: &str, line: u32| {
         assert!(message.starts_with(&format!("{expected} (recorded at {}:{line}:", file!())), "{message}");
     };
-    // The line is the user's also where the gradient is made of recorded operations.
+    // The error names the user's line, also for gradients of recorded operations.
     let x = tape.leaf(Tensor::from_vec(&[2], vec![1.0, 0.0]));
     let root = x.sqrt();
     let line = line!() - 1;
@@ -383,7 +382,7 @@ fn nan_finder_checks_recorded_and_sparse_gradients() {
         "affine: the gradient of the output is inf at index [0]",
         line,
     );
-    // A sparse gradient with two rows in one place.
+    // A sparse gradient with a repeated row.
     let rows = x.gather_rows([0, 0]);
     let line = line!() - 1;
     let sum = (rows * 3e38).sum();
@@ -393,7 +392,7 @@ fn nan_finder_checks_recorded_and_sparse_gradients() {
         line,
     );
     assert!(panic_of(|| sum.backward(&[&x])).contains("gather_rows: the gradient of input 0 is inf"));
-    // What overflows inside a gradient is not reported if the gradient is finite: softplus of a large number.
+    // An overflow inside a gradient is not reported if the result is finite: softplus of a large number.
     let large = tape.leaf(Tensor::scalar(200.0));
     assert_eq!(large.softplus().grad_graph(&[&large])[0].item(), 1.0);
 }
@@ -408,7 +407,7 @@ fn one_tape_gives_many_gradients_of_many_results() {
     let [a, b] = [&first, &second].map(|y| y.grad(&[&x]).remove(0));
     let sum: Vec<_> = a.as_slice().iter().zip(b.as_slice()).map(|(a, b)| a + b).collect();
     assert_close("both", both.grad(&[&x])[0].as_slice(), &sum, 1e-15);
-    // In any order and of any kind, and none of them changes the graph's values.
+    // In any order and by any method; none changes the values of the graph.
     let recorded = first.grad_graph(&[&x]).remove(0);
     assert_close("recorded", recorded.value().as_slice(), a.as_slice(), 1e-15);
     let seed = tape.constant(Tensor::scalar(2.0));
@@ -429,7 +428,7 @@ fn one_tape_gives_many_gradients_of_many_results() {
     assert_eq!(second.grad(&[&x])[0], b);
     recorded.sum().grad(&[&x]);
     assert_eq!(first.grad(&[&x])[0], a);
-    // The last one frees what it passes, and only that: not the leaf, which other graphs have too.
+    // `backward` frees its own nodes only, not the leaf, which other graphs share.
     let apart = x.cos().sum();
     assert_eq!(first.backward(&[&x])[0].dense(), Some(&a));
     assert!(second.try_grad(&[&x]).is_err());
@@ -449,7 +448,7 @@ fn scopes_without_recording_nest_and_end() {
     });
     assert!(tape.is_recording() && !inner.is_on_graph() && !outer.is_on_graph());
     assert_eq!(tape.len(), 1);
-    // A leaf that is made inside is a leaf, and what follows after the scope is recorded.
+    // A leaf made inside is a leaf, and operations after the scope are recorded.
     let leaf = tape.no_grad(|| tape.leaf(vector(&[3.0])));
     assert_eq!((&leaf * &outer).sum().grad(&[&leaf])[0].as_slice(), [4.0]);
 }
@@ -474,14 +473,14 @@ fn empty_and_scalar_tensors_pass_through_a_tape() {
     }
 }
 
-/// The slope of x^3 as a model that takes it with a gradient: 3 x^2.
+/// The slope of x^3 as a model that computes it by a gradient: 3 x^2.
 fn slope<'t>(x: &[Var<'t, f64>]) -> Var<'t, f64> {
     x[0].powi(3).sum().grad_graph(&[&x[0]]).remove(0)
 }
 
 #[test]
 fn gradient_inside_a_running_function_is_taken() {
-    // A checkpoint runs it unrecorded first.
+    // A checkpoint first runs it unrecorded.
     let tape = Tape::<f64>::new();
     let x = tape.leaf(Tensor::scalar(3.0));
     let y = tape.checkpoint(&[&x], slope);
@@ -490,14 +489,14 @@ fn gradient_inside_a_running_function_is_taken() {
     assert_eq!((second.item(), second.grad(&[&x])[0].item()), (18.0, 6.0));
     assert_eq!(tape.no_grad(|| tape.checkpoint(&[&x], slope)).item(), 27.0);
     assert_eq!(tape.checkpoint(&[&tape.constant(Tensor::scalar(3.0))], slope).item(), 27.0);
-    // With respect to an input whose own gradient nobody wants: a constant, or a variable that was not asked for.
+    // By an input without a requested gradient: a constant, or another variable.
     let by_second = |x: &[Var<'_, f64>]| (x[0].square() * &x[1]).sum().grad_graph(&[&x[1]]).remove(0).value().clone();
     let constant = tape.constant(Tensor::scalar(5.0));
     for other in [&constant, &x.exp()] {
         let y = tape.checkpoint(&[&x, other], move |x| x[0].tape().constant(by_second(x)) * &x[0]);
         assert_eq!((y.item(), y.grad(&[&x])[0].item(), y.grad_graph(&[&x])[0].item()), (27.0, 9.0, 9.0));
     }
-    // Differences of values, and functions of tensors.
+    // Compared with differences, also for functions of tensors.
     let at = Tensor::from_vec(&[2], vec![0.4, -1.1]);
     check_function(&Check::default(), &[at], |x| slope(x) * &x[0]).unwrap();
     let (y, grads) = raygrad::derivatives::value_and_grad(slope, &[Tensor::scalar(3.0)]);
@@ -505,7 +504,7 @@ fn gradient_inside_a_running_function_is_taken() {
 }
 
 #[test]
-fn what_has_no_gradient_is_an_error_and_never_zero() {
+fn missing_gradient_is_an_error_never_zero() {
     let tape = Tape::<f64>::new();
     let x = tape.leaf(Tensor::scalar(3.0));
     let c = tape.constant(Tensor::scalar(2.0));
@@ -525,16 +524,16 @@ fn what_has_no_gradient_is_an_error_and_never_zero() {
     }
     assert!(panic_of(|| c.jvp(&[&x], &[&c])).starts_with("gradient of a constant"));
     assert!(matches!(x.try_vjp(&tape.constant(vector(&[1.0])), &[&x]), Err(Error::Shape { op: "vjp", .. })));
-    // A gradient that is a constant is a function of the variable all the same, whose gradient is zero.
+    // A constant gradient is still a function of the variable, with the gradient zero.
     let third = (0..3).fold(x.square(), |y, _| y.grad_graph(&[&x]).remove(0));
     assert_eq!((third.item(), third.grad(&[&x])[0].item()), (0.0, 0.0));
     assert_eq!(x.affine(3.0, 1.0).hvp(&[&x], &[&c])[0].item(), 0.0);
-    // Nothing to ask for is fine.
+    // Requesting no gradient is valid.
     assert!(x.square().grad(&[]).is_empty());
 }
 
 #[test]
-fn a_scope_with_gradients_works_inside_of_one_without() {
+fn enable_grad_works_inside_no_grad() {
     let force = |x: &Var<'_, f64>| {
         let x = x.tracked();
         let energy = x.tape().enable_grad(|| x.powi(4).sum());
@@ -554,10 +553,10 @@ fn a_scope_with_gradients_works_inside_of_one_without() {
     assert_eq!(inside.value(), x.exp().value());
 }
 
-/// A table whose gradient has a form of its own: sums over the rows of `x[0]`, and everything where `x[1]` says.
+/// An operation with its own form of gradient: the sum of `x[0]`, with one number for all elements.
 struct Total;
 
-/// The same number everywhere.
+/// One number for all elements.
 struct Everywhere(Shape, f64);
 
 impl raygrad::SparseGrad<f64> for Everywhere {
@@ -589,8 +588,8 @@ impl Op<f64> for Total {
 }
 
 #[test]
-fn shares_of_every_kind_add_up_to_the_dense_gradient() {
-    /// An embedding with a penalty, tied weights, two tables, one of them with a share of an unknown kind.
+fn sparse_and_dense_shares_sum_to_the_gradient() {
+    /// An embedding with a penalty, tied weights, and two tables, one of them with a share of an unknown kind.
     type Model = for<'t> fn(&Var<'t, f64>, &Var<'t, f64>) -> Var<'t, f64>;
     let rows = |table: &Var<'_, f64>, index: [u32; 3]| table.value().shape()[0] > index[2] as usize;
     let models: [(&str, Model, Model); 5] = [
@@ -626,7 +625,7 @@ fn shares_of_every_kind_add_up_to_the_dense_gradient() {
             },
         ),
     ];
-    /// Rows by a product with a matrix of ones and zeros: every gradient of it is dense.
+    /// Gathers rows by a product with a matrix of ones and zeros, so that every gradient is dense.
     fn pick<'t>(table: &Var<'t, f64>, index: [u32; 3]) -> Var<'t, f64> {
         let rows = table.shape()[0];
         let one = |i: usize| f64::from(u8::from(index[i / rows] as usize == i % rows));
@@ -654,7 +653,7 @@ fn shares_of_every_kind_add_up_to_the_dense_gradient() {
     }
 }
 
-/// Breaks one of the promises of an operation of one input.
+/// Breaks one of the promises of an operation with one input.
 #[derive(Clone, Copy, PartialEq)]
 enum Broken {
     Output,
@@ -736,10 +735,10 @@ fn only_paths_to_wanted_variables_are_swept() {
         };
         let inner = x.sin();
         let y = &inner * &z;
-        // Asked about an interior variable, a sweep ends there.
+        // For an interior variable, the sweep ends there.
         assert_eq!(y.backward(&[&inner])[0].dense().unwrap().item(), 0.7);
         assert_eq!(inner.grad(&[&x])[0].item(), 0.5_f64.cos());
-        // What was freed beside the way is none of its business.
+        // Freed nodes off the path do not matter.
         let y = &inner * &z;
         inner.backward(&[&x]);
         assert_eq!(y.grad(&[&z])[0].item(), 0.5_f64.sin());
@@ -770,7 +769,7 @@ fn million_node_graph_is_swept_dropped_and_cleared() {
 
 #[test]
 fn small_gradients_on_long_tape_cost_own_nodes_only() {
-    // A gradient of three nodes, again and again: on a tape that is a thousand times longer it is not slower by much.
+    // Repeated gradients of three nodes: a tape that is a thousand times longer must not be much slower.
     let time = |before: usize| {
         let tape = Tape::<f64>::new();
         let x = tape.leaf(Tensor::scalar(0.3));
@@ -788,7 +787,7 @@ fn small_gradients_on_long_tape_cost_own_nodes_only() {
 }
 
 #[test]
-fn the_gradient_of_many_slices_costs_one_sum() {
+fn gradient_of_many_slices_costs_one_sum() {
     let (count, width) = (512, 2048);
     let tape = Tape::<f64>::new();
     let x = tape.leaf(Tensor::from_fn(&[count, width], |i| i as f64));
@@ -807,7 +806,7 @@ fn the_gradient_of_many_slices_costs_one_sum() {
     let (slices, got) = time(&sum);
     assert!(got == expected);
     assert!(slices < 20.0 * whole, "{slices} s for slices, {whole} s for the whole");
-    // Overlapping ones, reversed ones, diagonals.
+    // Overlapping and reversed slices, and diagonals.
     let x = tape.leaf(Tensor::from_fn(&[3, 3], |i| i as f64));
     let y = x.slice_axis(0, ..2).sum()
         + x.slice_axis(0, 1..3).square().sum()
@@ -829,7 +828,7 @@ fn errors_of_chained_methods_can_be_handled() {
     assert!(matches!(tape.try_run(|| x.grad(&[&x])), Err(Error::NotScalar { .. })));
     assert!(matches!(tape.try_run(|| tape.no_grad(|| x.sum()).grad(&[&x])), Err(Error::OfConstant { .. })));
     assert!(tape.is_recording(), "scopes end");
-    // Inside of a checkpoint, forwards and backwards, and from the inner of two scopes.
+    // Inside of a checkpoint, forwards and backwards, and from nested scopes.
     assert!(matches!(
         tape.try_run(|| tape.checkpoint(&[&x, &w], |x| x[0].matmul(&x[1]))),
         Err(Error::Shape { op: "matmul", .. })
@@ -842,7 +841,7 @@ fn errors_of_chained_methods_can_be_handled() {
     assert!(matches!(tape.try_run(|| (&x * 1e308) * 1e308), Err(Error::NonFinite { .. })));
     assert!(matches!(tape.try_run(|| tape.leaf(vector(&[f64::NAN]))), Err(Error::NonFinite { op: "leaf", .. })));
     tape.check_finite(false);
-    // Other panics pass through, and outside of a scope an error is a panic as ever.
+    // Other panics pass through, and outside of a scope errors panic as usual.
     assert_eq!(panic_of(|| tape.try_run(|| panic!("{}", "of another kind"))), "of another kind");
     assert!(panic_of(|| x.matmul(&w)).starts_with("matmul"));
     assert_eq!(tape.try_run(|| x.square().sum().grad(&[&x])).unwrap()[0], Tensor::full(&[2, 3], 2.0));

@@ -1,4 +1,4 @@
-//! What training can be told beside the photographs: codes, poses, distances, smooth tables, and a run that goes on.
+//! Training options: appearance embeddings, pose refinement, depth, smooth tables, and resuming.
 
 use raygrad::Schedule;
 use raygrad::nerf::camera::rotation_matrix;
@@ -30,14 +30,14 @@ fn instant() -> Config {
     config
 }
 
-/// So many photographs of so many pixels a side.
+/// Square images of the embedded scene.
 fn photographs(count: usize, size: usize) -> Dataset {
     let mut data = embedded(Split::Train, size);
     data.frames.truncate(count);
     data
 }
 
-/// So many steps; the mean of the last losses.
+/// Takes `steps` steps; returns the mean of the last losses.
 fn train(trainer: &mut Trainer, steps: u32) -> f64 {
     let losses: Vec<f64> = (0..steps).map(|i| trainer.step(f64::from(i) / f64::from(steps)).loss).collect();
     let last = &losses[losses.len().saturating_sub(10)..];
@@ -45,7 +45,7 @@ fn train(trainer: &mut Trainer, steps: u32) -> f64 {
 }
 
 #[test]
-fn a_run_goes_on_from_its_state_bit_for_bit() {
+fn training_resumes_from_its_state_bit_for_bit() {
     let data = Arc::new(photographs(12, 20));
     let mut everything = instant();
     everything.field.get_mut::<InstantConfig>().unwrap().appearance_embedding_dim = 3;
@@ -64,7 +64,7 @@ fn a_run_goes_on_from_its_state_bit_for_bit() {
             steps.map(|i| trainer.step(f64::from(i) / 60.0).loss.to_bits()).collect()
         };
         trainer.model.params.set_lazy(|name| name == "field.codes", false);
-        // One beyond the steps in which all cells are looked at, and far into those.
+        // One beyond the steps that update all cells of the grid, and far within those.
         let before = [261, 21][i];
         go_on(&mut trainer, 0..before);
         let state = trainer.state().unwrap();
@@ -99,7 +99,7 @@ fn a_run_goes_on_from_its_state_bit_for_bit() {
 }
 
 #[test]
-fn what_is_no_state_of_this_run_changes_nothing() {
+fn foreign_state_is_an_error_and_changes_nothing() {
     let data = Arc::new(photographs(6, 16));
     let new = |config: Config| Trainer::new(config, data.clone()).unwrap();
     let mut trainer = new(instant());
@@ -137,9 +137,9 @@ fn what_is_no_state_of_this_run_changes_nothing() {
 }
 
 #[test]
-fn codes_take_up_what_photographs_differ_in() {
+fn embeddings_absorb_differences_of_images() {
     let mut data = photographs(24, 20);
-    // Of each camera there are two photographs, and the first is darker.
+    // Each camera has two images; the first is darker.
     for i in (0..24).step_by(2) {
         data.frames[i] = data.frames[i + 1].clone();
     }
@@ -158,7 +158,7 @@ fn codes_take_up_what_photographs_differ_in() {
     let codes = model.params.get(model.params.find("field.codes").unwrap());
     assert_eq!(codes.shape(), [24, 4]);
     model.finish();
-    // New views are as bright as the mean of both kinds.
+    // New views have the mean brightness of both kinds.
     let camera = &data.frames[3].camera;
     let mean = |model: &Model<f32>| {
         let seen = model.render(camera, [0.0; 3]);
@@ -174,7 +174,7 @@ fn codes_take_up_what_photographs_differ_in() {
     };
     let [dark, bright, usual] = [with_code(model, 2), with_code(model, 3), mean(model)];
     assert!(bright > 1.5 * dark && usual > 1.1 * dark && usual < bright / 1.1, "{dark} {usual} {bright}");
-    // The number of photographs goes with the model.
+    // The number of images is stored with the model.
     let extent: SceneBox = serde_json::from_str(&serde_json::to_string(&model.scene_box).unwrap()).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.safetensors");
@@ -192,7 +192,7 @@ fn pose_refinement_finds_known_offsets() {
     let mut known = Trainer::new(config.clone(), Arc::new(right.clone())).unwrap();
     known.model.params.freeze(|name| name == "poses");
     train(&mut known, 300);
-    // A degree or two, and some hundredths of the scene's size.
+    // One or two degrees, and a few hundredths of the scene's size.
     let mut wrong = right.clone();
     for (i, frame) in wrong.frames.iter_mut().enumerate() {
         let [a, b, c] = [1.0, 2.0, 3.0].map(|k| (k * (i as f64 + 1.0)).sin());
@@ -211,7 +211,7 @@ fn pose_refinement_finds_known_offsets() {
             .map(|(i, (wrong, right))| {
                 let [found, right] = [trainer.model.learned_camera(i, &wrong.camera).pose, right.camera.pose];
                 let turn = (found.matrix3.transpose() * right.matrix3).col(2).angle_between(DVec3::Z);
-                // Where the scene is seen: what a turn and a step aside have in common no photograph can tell.
+                // At scene points, since images cannot separate the common effect of a rotation and a sideways step.
                 let places = (0..8).map(|i| 0.5 * DVec3::from([0, 1, 2].map(|k| f64::from(i >> k & 1) * 2.0 - 1.0)));
                 let apart = places.map(|place| {
                     let [a, b] = [found, right].map(|pose| pose.matrix3.transpose() * (place - pose.translation));
@@ -229,7 +229,7 @@ fn pose_refinement_finds_known_offsets() {
     println!("poses: {before:?} to {after:?}, loss {first} to {last}");
     assert!(last < 0.5 * first, "{first} {last}");
     assert!(after[0] < 0.6 * before[0] && after[1] < 0.3 * before[1], "{before:?} {after:?}");
-    // Nothing is carved away that photographs show to be empty from where they were not.
+    // With pose refinement nothing is carved: the given poses may be wrong.
     assert_eq!(Trainer::new(known.model.config.clone(), Arc::new(wrong.clone())).unwrap().stats().occupied, 1.0);
     let error = Model::<f32>::new(trainer.model.config.clone(), SceneBox { frames: 0, ..trainer.model.scene_box }, 0);
     assert!(error.err().unwrap().to_string().starts_with("`poses`"));
@@ -252,7 +252,7 @@ fn scene_and_poses_are_learned_together() {
         let data = Arc::new(wrong.clone());
         let loss = |poses| {
             let mut config = Config { poses, sampler: sampler.clone(), ..instant() };
-            // What learns poses does not carve; neither does what it is compared with.
+            // Pose refinement does not carve, so the comparison does not either.
             if let Some(marching) = config.sampler.get_mut::<MarchingConfig>() {
                 marching.occupancy.skip.carving = 0;
             }
@@ -313,7 +313,7 @@ fn depth_loss_finds_measured_surfaces() {
     }
 }
 
-/// A term that is nothing, and writes down what it is given to draw from.
+/// A loss term of 0 that records its seeds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SpyConfig {
@@ -338,7 +338,7 @@ impl<T: Scalar> LossTerm<T> for SpyConfig {
 }
 
 #[test]
-fn every_term_draws_anew_in_every_tile_of_every_step() {
+fn loss_terms_get_a_new_seed_per_tile_and_step() {
     let terms = [0, 1].map(|number| LossTermConfig::new(SpyConfig { number })).to_vec();
     let mut trainer = Trainer::new(Config { loss_terms: terms, ..instant() }, Arc::new(photographs(6, 16))).unwrap();
     train(&mut trainer, 3);
@@ -349,7 +349,7 @@ fn every_term_draws_anew_in_every_tile_of_every_step() {
 }
 
 #[test]
-fn a_table_that_is_to_be_smooth_becomes_smoother() {
+fn total_variation_smooths_the_table() {
     let data = Arc::new(photographs(12, 20));
     let mut config = Config::preset(Preset::Voxel);
     config.field = FieldConfig::new(VoxelConfig { resolution: 16, direction_degree: 1 });
@@ -378,7 +378,7 @@ fn a_table_that_is_to_be_smooth_becomes_smoother() {
 #[test]
 fn gradient_scaling_damps_samples_near_cameras() {
     let mut data = photographs(12, 24);
-    // Its unit is 2, and the nearest samples are 2 away.
+    // The unit of the box is 2, and the nearest samples are 2 away.
     data.bounds = [DVec3::splat(-3.0), DVec3::splat(3.0)];
     let data = Arc::new(data);
     let moved = |gradient_scaling_distance: f64| {
@@ -387,7 +387,8 @@ fn gradient_scaling_damps_samples_near_cameras() {
         let grid = trainer.model.params.find("field.table").unwrap();
         let before = trainer.model.params.get(grid).clone();
         let first = trainer.step(0.3).loss;
-        // The first step of Adam has the size of its rate whatever the gradient; the second tells.
+        // Adam's first step has the size of its learning rate for any gradient, so the second step shows the
+        // difference.
         let second = trainer.step(0.3).loss;
         let after = trainer.model.params.get(grid);
         let far = before.as_slice().iter().zip(after.as_slice()).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();

@@ -1,13 +1,13 @@
-//! A parser on a number of damaged files: each is read or refused, without a panic, and in bounded memory.
+//! Tests of a parser on damaged files: each is read or refused, without a panic and in bounded memory.
 //!
-//! In the suite they are few. `PROPTEST_CASES=1000000 cargo test --release --workspace campaign -- --nocapture` tries a million for each
-//! parser, in hours, and prints a line for each.
+//! The suite tries few. `PROPTEST_CASES=1000000 cargo test --release --workspace campaign -- --nocapture` tries a
+//! million per parser, which takes hours, and prints a line for each.
 
 use super::damage::{damage, damaged};
 use super::tally::{Bound, Tally, cases};
 use proptest::prelude::*;
 
-/// Lets a parser try damaged forms of some whole files, all of which it must accept; `clear` looks at what it says of others.
+/// Runs a parser on damaged forms of some whole files, which it must accept undamaged. `clear` checks the errors.
 pub fn campaign<E: ToString>(
     name: &str,
     whole: &[Vec<u8>],

@@ -1,33 +1,33 @@
-//! Damage to files, for the tests of everything that reads one.
+//! Damage to files, for tests of parsers.
 
 use proptest::prelude::*;
 
-/// What is done to a file: at a place, as a share of its length.
+/// A change of a file at a position, which is a share of its length.
 #[derive(Debug, Clone)]
 pub enum Damage {
-    /// Cut off.
+    /// Removes the rest.
     Truncate(f64),
-    /// One bit.
+    /// Flips a bit.
     Flip(f64, u8),
-    /// One byte.
+    /// Sets a byte.
     Set(f64, u8),
-    /// Bytes more.
+    /// Inserts bytes.
     Insert(f64, Vec<u8>),
-    /// Bytes less.
+    /// Removes bytes.
     Remove(f64, usize),
-    /// Bytes twice.
+    /// Repeats bytes.
     Repeat(f64, usize),
-    /// A part twice, from a place to another.
+    /// Copies a part to another position.
     Double(f64, f64),
-    /// In place of the next number or word of a text.
+    /// Replaces the next number or word of a text.
     Token(f64, &'static str),
-    /// In place of 1, 2, 4 or 8 bytes, the least first or last.
+    /// Replaces 1, 2, 4 or 8 bytes by an integer, little- or big-endian.
     Integer(f64, u64, usize, bool),
-    /// From a place on, what another whole file has from a place on.
+    /// Replaces the rest by a part of another whole file.
     Splice(f64, f64),
 }
 
-/// What counts and lengths break at.
+/// Critical values of counts and lengths.
 const INTEGERS: [u64; 12] = [
     0,
     1,
@@ -89,7 +89,7 @@ pub fn damage() -> impl Strategy<Value = Vec<Damage>> {
     prop::collection::vec(one, 1..5)
 }
 
-/// The file after all of that, beside another that is whole.
+/// Applies all damages; `other` is another whole file.
 pub fn damaged(bytes: &[u8], other: &[u8], damage: &[Damage]) -> Vec<u8> {
     let mut out = bytes.to_vec();
     for damage in damage {
@@ -148,7 +148,7 @@ pub fn damaged(bytes: &[u8], other: &[u8], damage: &[Damage]) -> Vec<u8> {
     out
 }
 
-/// Errors are one line, and name the file that is at fault.
+/// Checks that an error is one line and names the file.
 #[track_caller]
 pub fn clear(error: impl ToString, name: &str) {
     let text = error.to_string();

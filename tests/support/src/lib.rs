@@ -1,6 +1,6 @@
-//! What tests of several crates use: damage to files, and how much memory reading them takes.
+//! Helpers for tests of several crates: damage to files, and memory measurements of parsers.
 //!
-//! A test program that links this counts what it allocates ([`memory`]).
+//! A test program that links this crate counts its allocations ([`memory`]).
 
 pub mod campaign;
 pub mod damage;

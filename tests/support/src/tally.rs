@@ -1,34 +1,34 @@
-//! What became of damaged files, and how many are tried.
+//! Counts of accepted and refused files, and the number of tests.
 
 use super::memory::peak;
 use proptest::prelude::ProptestConfig;
 use std::cell::Cell;
 use std::time::Instant;
 
-/// The most bytes that a parser may take: so many for each byte of its file, and so many for any.
+/// The most bytes that a parser may allocate: some per byte of its file, plus a constant.
 #[derive(Debug, Clone, Copy)]
 pub struct Bound {
-    /// For each byte.
+    /// Bytes per byte of the file.
     pub times: usize,
-    /// For any file.
+    /// The constant.
     pub plus: usize,
 }
 
 impl Bound {
-    /// The most for a file of that many bytes.
+    /// The limit for a file of `length` bytes.
     pub fn of(self, length: usize) -> usize {
         self.times * length + self.plus
     }
 }
 
-/// How many files are tried: few, or what PROPTEST_CASES says.
+/// The number of files to try: few, or `PROPTEST_CASES`.
 pub fn cases() -> ProptestConfig {
     let cases = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(400);
-    // The least input that fails is printed, and the same seed finds it again.
+    // The smallest failing input is printed, and the fixed seed reproduces it.
     ProptestConfig { cases, failure_persistence: None, ..ProptestConfig::default() }
 }
 
-/// What became of the files.
+/// Counts of the results.
 pub struct Tally {
     name: String,
     start: Instant,
@@ -37,12 +37,12 @@ pub struct Tally {
 }
 
 impl Tally {
-    /// Nothing yet.
+    /// Starts at 0.
     pub fn new(name: &str) -> Self {
         Tally { name: name.to_owned(), start: Instant::now(), counts: Default::default(), peak: Cell::new(0) }
     }
 
-    /// Lets a parser try a file of that many bytes; it is to take no more memory than the bound allows.
+    /// Runs a parser on a file of `length` bytes and checks its memory.
     pub fn parse<T, E>(&self, length: usize, bound: Bound, parse: impl FnOnce() -> Result<T, E>) -> Result<T, E> {
         let (result, bytes) = peak(parse);
         let which = &self.counts[usize::from(result.is_err())];
@@ -52,7 +52,7 @@ impl Tally {
         result
     }
 
-    /// Files that were accepted, and those that were refused.
+    /// The numbers of accepted and refused files.
     pub fn counts(&self) -> [u64; 2] {
         [0, 1].map(|which| self.counts[which].get())
     }

@@ -50,7 +50,7 @@ fn sigmoid<T: Scalar>() {
 fn logarithm_of_zero<T: Scalar>() {
     let tape = Tape::new();
     let p = tape.leaf(vector::<T>(&[0.0, 0.5, 1.0]));
-    // Of the entropy the slope at 0 is infinite in truth; of x ln y it is 0 by convention where x is 0.
+    // The exact slope of the entropy at 0 is infinite; that of x ln y is 0 by convention where x is 0.
     let weight = tape.leaf(vector::<T>(&[0.0, 0.5, 1.0]));
     let entropy = -weight.xlogy(&p);
     within("entropy", entropy.value().as_slice()[0].to_f64(), 0.0, 0.0);

@@ -4,7 +4,7 @@ use super::support::*;
 use raygrad::nerf::volume::{OpticalDepth, weights};
 use raygrad::{Scalar, Segments, Tape, Tensor};
 
-/// What one sample of colour 1 gives: alpha, what is left of the light, and the gradient of alpha by the density.
+/// Alpha, the remaining light, and the gradient of alpha by the density, for one sample of colour 1.
 fn one_sample<T: Scalar>(sigma: f64, delta: f64) -> [f64; 3] {
     let tape = Tape::new();
     let density = tape.leaf(vector::<T>(&[sigma]));
@@ -20,7 +20,7 @@ fn alpha_keeps_its_digits<T: Scalar>() {
     let tolerance = by_type::<T>(2e-7, 5e-16);
     for (x, name) in [(1e-45, "alpha(1e-45)"), (1e-8, "alpha(1e-8)"), (1e-7, "alpha(1e-7)"), (1e-4, "alpha(1e-4)")] {
         let [alpha, _, slope] = one_sample::<T>(x, 1.0);
-        // The density as the type holds it; the constant is that of the number as it is written.
+        // The expected value is for the rounded density, while the constant is for the decimal number.
         near::<T>(name, alpha, -(-round::<T>(x)).exp_m1(), tolerance);
         near::<T>(name, alpha, constant(name), tolerance.max(by_type::<T>(6e-8, 2e-16)) + tolerance);
         near::<T>("slope", slope, (-round::<T>(x)).exp(), tolerance);
@@ -64,7 +64,7 @@ fn no_density_or_no_length_is_nothing<T: Scalar>() {
     }
     // Any density fills an infinite interval.
     assert_eq!(one_sample::<T>(1e-30, f64::INFINITY), [1.0, 0.0, 0.0]);
-    // The same by way of plain operations, which is where second derivatives come from.
+    // Plain operations, as second derivatives use them, give the same.
     let tape = Tape::new();
     let density = tape.leaf(vector::<T>(&[0.5, 0.0, 0.25]));
     let (op, segments) = (OpticalDepth::new(vector::<T>(&[1.0, f64::INFINITY, 1.0])), Segments::uniform(1, 3));
@@ -88,7 +88,7 @@ fn negative_densities_and_intervals_are_errors<T: Scalar>() {
         tape.apply(op(), &[&tape.leaf(vector(&[1.0, -0.5]))]).into_value()
     });
     assert!(text.contains("density[1]"), "{text}");
-    // A logarithm may be anything.
+    // A log density may have any value.
     let log = OpticalDepth::of_log_density(Tensor::<T>::ones(&[2]));
     assert!(log.check(&vector(&[-5.0, -0.5])).is_ok());
 }

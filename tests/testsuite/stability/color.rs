@@ -1,4 +1,4 @@
-//! The sRGB transfer curve, and the space in which blending happens.
+//! The sRGB transfer curve, and the space of blending.
 
 use super::support::*;
 use raygrad::nerf::{Image, SrgbDecode, SrgbEncode, dataset::background, quantise, srgb_decode, srgb_encode};
@@ -12,7 +12,7 @@ fn the_curve_and_its_slope_are_finite_everywhere<T: Scalar>() {
     for decode in [false, true] {
         let tape = Tape::new();
         let leaf = tape.leaf(vector::<T>(&x));
-        // Decoding 1e30 overflows f32: no finite number is right there.
+        // Decoding 1e30 overflows f32, where no finite result exists.
         let y = if decode { srgb_decode(&leaf.slice_axis(0, 2..8)) } else { srgb_encode(&leaf) };
         finite("value", y.value());
         finite("slope", &y.sum().grad(&[&leaf])[0]);
@@ -37,7 +37,7 @@ fn the_curve_and_its_slope_are_finite_everywhere<T: Scalar>() {
     near::<T>("the slope below", below[1], 12.92, tolerance);
 }
 
-/// Matrix: 256 codes round-trip, through the pictures' bytes too.
+/// Matrix: 256 codes round-trip, also through image bytes.
 fn all_codes_round_trip<T: Scalar>() {
     let codes: Vec<f64> = (0..256).map(|code| f64::from(code) / 255.0).collect();
     let tape = Tape::new();
@@ -52,7 +52,8 @@ fn all_codes_round_trip<T: Scalar>() {
 
 both!(the_curve_and_its_slope_are_finite_everywhere, all_codes_round_trip);
 
-/// Catalogue: half of white over black is .5 in the space of the files, in which blending happens here, and .735 in light.
+/// Catalogue: half of white over black is 0.5 in the space of the files, where blending happens here, and 0.735 in
+/// linear light.
 #[test]
 fn blending_happens_in_code_values() {
     let half = Image { width: 1, height: 1, channels: 4, data: vec![1.0, 1.0, 1.0, 0.5] };

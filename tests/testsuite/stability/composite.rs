@@ -19,7 +19,7 @@ fn ray<T: Scalar>(x: &[f64], colour: &[f64]) -> ([f64; 2], Vec<f64>, Vec<f64>) {
     (both, numbers(&grads[0]), numbers(&grads[1]))
 }
 
-/// `dC/dx_i = e^-x_i T_i (c_i - B)`, with the light B that comes from behind sample i added up sample by sample.
+/// `dC/dx_i = e^-x_i T_i (c_i - B)`, with the light B from behind sample i summed sample by sample.
 fn expected_slopes(x: &[f64], colour: &[f64]) -> Vec<f64> {
     let slope = |i: usize| {
         let before: f64 = x[..i].iter().sum();
@@ -34,7 +34,7 @@ fn expected_slopes(x: &[f64], colour: &[f64]) -> Vec<f64> {
 }
 
 /// Matrix: composite of N = 0, N = 1, nothing, everything.
-fn no_sample_one_sample_nothing_and_everything<T: Scalar>() {
+fn composite_of_extreme_rays_is_exact<T: Scalar>() {
     assert_eq!(ray::<T>(&[], &[]).0, [0.0, 1.0], "no samples: the background");
     let (out, d_density, d_colour) = ray::<T>(&[0.75], &[0.5]);
     let tolerance = by_type::<T>(2e-7, 5e-16);
@@ -60,7 +60,7 @@ fn gradient_behind_opaque_samples<T: Scalar>() {
             within(&format!("opaque {opaque:?}, sample {i}"), *got, expected, by_type::<T>(2e-7, 5e-16));
         }
     }
-    // The same of the product itself: alpha = (.3, 1, .5), whose gradient a division by 1 - alpha would make NaN.
+    // The product itself: alpha = (0.3, 1, 0.5), whose gradient a division by 1 - alpha would make NaN.
     let tape = Tape::new();
     let alpha = tape.leaf(vector::<T>(&[0.3, 1.0, 0.5]));
     let left = (1.0 - &alpha).cumprod(0);
@@ -77,7 +77,7 @@ fn transmittance_far_behind<T: Scalar>() {
     let (op, x) = (Weights::new(Segments::uniform(1, 6)), vector::<T>(&[0.1, 20.0, 0.5, 0.5, 30.0, 0.2]));
     let transmittance = op.transmittance(&x, &Pool::new());
     let weights = op.forward(&[&x], &Pool::new());
-    // The depth .1 is rounded, and T falls by the error of the sum: half an ULP of 20.6 in f32.
+    // The depth 0.1 is rounded, and T carries the error of the sum: half an ULP of 20.6 in f32.
     for i in 2..6 {
         let expected = constant(&format!("T[{i}]"));
         near::<T>("transmittance", transmittance.as_slice()[i].to_f64(), expected, by_type::<T>(2e-6, 2e-14));
@@ -97,7 +97,7 @@ fn transmittance_far_behind<T: Scalar>() {
     near::<T>("192 steps", left, constant("transmittance(40)"), by_type::<T>(7e-6, 1e-13));
 }
 
-/// Gate: the sum of the weights and what is left is 1.
+/// Gate: the weights and the remaining light sum to 1.
 fn weights_and_what_is_left_are_everything<T: Scalar>() {
     let (mut random, mut worst) = (noise(5), 0.0_f64);
     for scale in [1e-6, 0.01, 1.0, 100.0] {
@@ -126,7 +126,7 @@ fn gradient_keeps_its_digits_where_little_light_is_left<T: Scalar>() {
     }
     println!("gradient of densities down to T = 1e-6, {}: {worst:.1e} T", T::NAME);
     assert!(depth > 13.0, "the light must fall to about 1e-6, is at {:e}", (-depth).exp());
-    // What passes a thick sample: 1 - alpha has lost its digits there, e^-x has not.
+    // The light behind a thick sample: 1 - alpha has lost its digits there, e^-x has not.
     let (x, colour) = ([16.0, 0.5], [1.0, 0.25]);
     let (_, got, _) = ray::<T>(&x, &colour);
     near::<T>("depth 16", got[0], expected_slopes(&x, &colour)[0], by_type::<T>(1e-6, 1e-13));
@@ -176,7 +176,7 @@ fn exponential_density<T: Scalar>() {
         let out = composite(op, &segments, [&density, &tape.constant(Tensor::ones(&[1, 1]))]).slice_axis(1, ..1).sum();
         out.grad(&[&density])[0].item().to_f64()
     };
-    // Not the gradient that is clamped at 15, and not the one that is clamped at -15.
+    // A gradient clamped at 15 or at -15 would differ.
     let tolerance = by_type::<T>(2e-6, 1e-14);
     near::<T>("at 16", slope(16.0), constant("exponential density at 16: gradient of alpha"), tolerance);
     near::<T>(
@@ -187,7 +187,7 @@ fn exponential_density<T: Scalar>() {
     );
 }
 
-/// Long run: a ray of 1e5 samples, in f32 as accurate as a short one.
+/// Long run: a ray of 1e5 samples is as accurate in f32 as a short one.
 fn a_ray_of_a_hundred_thousand_samples<T: Scalar>() {
     let n = 100_000;
     let x: Vec<f64> = (0..n).map(|i| round::<T>(1e-4 * (1.0 + (i as f64 * 0.01).sin()))).collect();
@@ -209,7 +209,7 @@ fn a_ray_of_a_hundred_thousand_samples<T: Scalar>() {
 }
 
 both!(
-    no_sample_one_sample_nothing_and_everything,
+    composite_of_extreme_rays_is_exact,
     gradient_behind_opaque_samples,
     transmittance_far_behind,
     weights_and_what_is_left_are_everything,

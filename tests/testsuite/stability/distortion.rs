@@ -5,7 +5,7 @@ use raygrad::nerf::Distortion;
 use raygrad::nerf::volume::{OpticalDepth, weights};
 use raygrad::{Scalar, Segments, Tape};
 
-/// Loss and gradients of one ray of samples of this width, starting at `start`, and the same by definition in f64.
+/// Loss and gradients of one ray of samples of this width from `start` on, and the same by definition in f64.
 fn both_ways<T: Scalar>(weights: &[f64], width: f64, start: f64) -> [(f64, Vec<f64>); 2] {
     let n = weights.len();
     let m: Vec<f64> = (0..n).map(|i| round::<T>(start + width * (i as f64 + 0.5))).collect();
@@ -45,7 +45,7 @@ fn samples_of_every_width<T: Scalar>() {
     }
 }
 
-/// With the weights of a ray: the loss of densities, and its gradient, are finite where nothing and everything is.
+/// With the weights of a ray, the loss and its gradient by densities are finite for empty and opaque rays.
 fn of_densities<T: Scalar>() {
     let n = 16;
     let segments = || Segments::uniform(1, n);

@@ -1,4 +1,4 @@
-//! Captures of very many poses: what is said of them is bounded by their number.
+//! Captures with very many poses: reports are bounded by their number.
 
 use raygrad::nerf::Camera;
 use raygrad::nerf::dataset::{Capture, Format, Split, View};
@@ -7,7 +7,7 @@ use raygrad::nerf::glam::DVec3;
 use raygrad_test_support::memory::peak;
 use std::path::Path;
 
-/// Photographs with one pose but for the last one, every eighth held out.
+/// Images with one common pose except the last; every eighth is held out.
 fn capture(count: usize) -> Capture {
     let view = |i: usize| {
         let eye = if i + 1 == count { DVec3::new(9.0, 0.0, 1.0) } else { DVec3::new(4.0, 0.0, 1.0) };
@@ -26,7 +26,7 @@ fn capture(count: usize) -> Capture {
 
 #[test]
 fn doctor_takes_memory_in_proportion_to_equal_poses() {
-    // A pair of names for each pair of photographs was 8 GB of 20 000.
+    // Listing all pairs of 20 000 images took 8 GB.
     for count in [2_000, 20_000] {
         let capture = capture(count);
         let (report, bytes) = peak(|| examine_cameras(&capture, None));

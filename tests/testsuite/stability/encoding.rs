@@ -9,7 +9,7 @@ use std::f64::consts::PI;
 fn exact_at_every_level_and_size<T: Scalar>() {
     let mut x = vec![0.0, -0.0, 0.3, 3.999, 1e-30];
     x.extend([1.0, 4.0, 1e3, 1e6, 1e3 + 0.37, 123.456].iter().flat_map(|&x| [x, -x]));
-    // Found by a property test: twice the last is infinite in f32.
+    // A property test found these: twice the last overflows f32.
     let x: Vec<f64> = x.into_iter().chain([1e30, -3.158_787_907e38]).map(round::<T>).collect();
     let tolerance = by_type::<T>(3e-7, 2e-15);
     for levels in [10, 12, 16] {
@@ -34,7 +34,7 @@ fn exact_at_every_level_and_size<T: Scalar>() {
     }
 }
 
-/// What is not finite stays where it is.
+/// Non-finite coordinates affect only their own row.
 fn bad_coordinates_stay_in_their_row<T: Scalar>() {
     let tape = Tape::new();
     let input = tape.leaf(tensor::<T>(&[3, 1], &[f64::INFINITY, 0.25, f64::NAN]));

@@ -1,4 +1,4 @@
-//! Every parser on damaged input: an error that names the file, and never a panic.
+//! Every parser on damaged input gives an error that names the file, never a panic.
 
 use proptest::prelude::*;
 use rawzip::{CompressionMethod, ZipArchiveWriter};
@@ -20,7 +20,7 @@ use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
 
-/// A dataset of two pictures of 4 x 4 pixels.
+/// A dataset of two images of 4 x 4 pixels.
 fn scene(folder: &Path) -> Vec<u8> {
     for i in 0..2 {
         let image = Image { width: 4, height: 4, channels: 4, data: vec![0.25 * (i + 1) as f32; 64] };
@@ -60,7 +60,7 @@ fn params<T: Scalar>() -> Params<T> {
     params
 }
 
-/// Whether no number of the field or the grid makes a model too large to be built in a test.
+/// Returns true if no number of the field or the grid makes the model too large for a test.
 fn is_small(config: &Config) -> bool {
     let all = serde_json::to_value(config).unwrap();
     fn most(value: &serde_json::Value) -> f64 {
@@ -146,7 +146,7 @@ proptest! {
     }
 }
 
-/// Lets a parser of files try damaged ones of that name; of errors of more than the file `named` is said to name it.
+/// Runs a parser of files on damaged ones of that name. Errors that concern more than the file must contain `named`.
 fn campaign_on(
     name: &str,
     file: &Path,
@@ -162,7 +162,7 @@ fn campaign_on(
     alone(|| campaign(name, whole, bound, parse, |error| clear(error, named)));
 }
 
-/// Does something on one thread, whose memory is counted.
+/// Runs on one thread, whose memory is counted.
 fn alone(work: impl FnOnce() + Send) {
     rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap().install(work);
 }
@@ -171,14 +171,14 @@ fn said<T>(result: Result<T, impl ToString>) -> Result<T, String> {
     result.map_err(|error| error.to_string())
 }
 
-/// A picture of a few pixels with that ending.
+/// An image of a few pixels in a format.
 fn picture(ending: &str, channels: usize) -> Vec<u8> {
     let data = (0..45 * channels).map(|i| (i * i % 97) as f32 / 96.0).collect();
     let photo = Photo::from(Image { width: 9, height: 5, channels, data });
     written(&format!("picture.{ending}"), |path| photo.save(path).unwrap())
 }
 
-/// A PNG file of grey pixels of 16 bits that says that it is of that size, and holds these bytes uncompressed.
+/// A 16-bit grey PNG whose header has this size, with these bytes uncompressed.
 fn deep_png(width: u32, height: u32, data: &[u8]) -> Vec<u8> {
     let chunk = |name: &[u8; 4], data: &[u8]| {
         let named = [name, data].concat();
@@ -197,11 +197,11 @@ fn deep_png(width: u32, height: u32, data: &[u8]) -> Vec<u8> {
         .concat()
 }
 
-/// What is decoded may take as much as [`Photo::open`] allows: four times where it is changed to another kind of pixels, and six
-/// in the decoder of WebP.
+/// Decoded images may take as much as [`Photo::open`] allows: four times after a conversion of the pixel format, six in
+/// the WebP decoder.
 const DECODED: Bound = Bound { times: 8 << 14, plus: 8 << 26 };
 
-/// With transparency, what a camera says and losses: see `reference/lossy.py`.
+/// An image with transparency, camera metadata and lossy compression: see `reference/lossy.py`.
 const LOSSY: &[u8] = include_bytes!("reference/lossy.webp");
 
 #[test]
@@ -230,9 +230,9 @@ fn campaign_pictures() {
         });
     }
 }
-/// Settings whose product no memory holds are refused before anything is allocated.
+/// Settings whose product no memory could hold are refused before any allocation.
 #[test]
-fn models_that_no_memory_holds_are_refused() {
+fn oversized_models_are_errors() {
     let mut classic = Config::preset(Preset::Classic);
     if let Some(field) = classic.field.get_mut::<ClassicConfig>() {
         (field.depth, field.width) = (1 << 14, 1 << 14);
@@ -247,7 +247,7 @@ fn models_that_no_memory_holds_are_refused() {
     }
 }
 
-/// A box that is none, or that no number describes; more photographs than anybody has.
+/// Invalid and non-finite boxes, and too many images.
 #[test]
 fn extents_are_checked() {
     for bad in [f64::NAN, f64::INFINITY, 2.0] {
@@ -262,7 +262,7 @@ fn extents_are_checked() {
     }
 }
 
-/// What a capture says beside its photographs: which pixels are used, and how far they are.
+/// The other files of a capture: masks and depth.
 #[test]
 fn campaign_masks_and_depths() {
     let npy = |values: &[f32]| {
@@ -275,7 +275,7 @@ fn campaign_masks_and_depths() {
     std::fs::remove_file(folder.path().join("transforms_train.json")).unwrap();
     let text =
         text.replace("\"./r_0\",", "\"./r_0\", \"mask_path\": \"mask.png\", \"depth_file_path\": \"depth.png\",");
-    // Not both cameras in one place.
+    // The cameras must differ in position.
     let text = text.replacen("0.0, 0.5]", "0.0, 1.5]", 1);
     std::fs::write(folder.path().join("transforms.json"), text).unwrap();
     let grey = Image { width: 4, height: 4, channels: 1, data: (0..16).map(|i| (i % 3) as f32 / 2.0).collect() };
@@ -321,7 +321,7 @@ fn campaign_parameters_as_safetensors() {
             |error| clear(error, ""),
         )
     });
-    // In halves it fits any number type.
+    // In 16 bits it fits any number type.
     assert!(params::<f64>().load_safetensors(&whole[0]).is_err(), "another number type");
 }
 
@@ -336,7 +336,7 @@ fn campaign_states_of_optimisers() {
     alone(|| campaign("optimiser", &whole, Bound { times: 64, plus: 1 << 16 }, parse, |error| clear(error, "")));
 }
 
-/// Arrays in an archive, compressed, as NumPy writes them: see `autograd/nn/tests/data/README.md`.
+/// Compressed arrays in an archive, written by NumPy: see `autograd/nn/tests/data/README.md`.
 const COMPRESSED: &[u8] = include_bytes!("../../../autograd/nn/tests/data/compressed.npz");
 
 #[test]
@@ -344,7 +344,7 @@ fn campaign_parameters_as_npz() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.npz");
     let whole = [written("model.npz", |path| params::<f32>().save_npz(path).unwrap()), COMPRESSED.to_vec()];
-    // What is unpacked, and as much again for its numbers.
+    // The unpacked bytes, and as much again for the numbers.
     campaign_on("npz", &path, &whole, Bound { times: 4 << 6, plus: 4 << 26 }, || {
         let read = said(Params::<f32>::read_npz(&path));
         let mut single = params::<f32>();
@@ -364,7 +364,7 @@ fn campaign_models() {
     campaign_on("model", &path, &whole, Bound { times: 64, plus: 1 << 20 }, parse);
 }
 
-/// What a checkpoint holds, whatever its checksum says.
+/// The content of a checkpoint, without its checksum.
 #[test]
 fn campaign_states_of_training() {
     let data = Arc::new(embedded(Split::Train, 4));
@@ -379,7 +379,7 @@ fn campaign_states_of_training() {
     let trainer = std::cell::RefCell::new(trained(0));
     let parse = |bytes: &[u8]| said(trainer.borrow_mut().load_state(bytes));
     campaign("training", &whole, Bound { times: 64, plus: 4 << 20 }, parse, |error| clear(error, "`"));
-    // Of what was accepted last, steps can be taken.
+    // The last accepted state allows steps.
     assert!(trainer.into_inner().step(0.5).step > 0);
 }
 
@@ -390,9 +390,9 @@ fn campaign_occupancy_grids() {
         OccupancyGrid::new(extent().bounds, &config).unwrap()
     };
     let whole = [grid(8).to_bytes(), grid(8).occupied_to_bytes(), grid(4).to_bytes()];
-    // What is damaged is its header alone, half of the time: damage to so many bytes rarely falls there.
+    // Half of the time only the header is damaged, since damage to so many bytes rarely hits it.
     let heads = whole.each_ref().map(|bytes| bytes[..64].to_vec());
-    // Of a bit, a density is kept too, and what the empty space around it is.
+    // Each bit also takes a density and the empty space around it.
     let bound = Bound { times: 128, plus: 1 << 16 };
     campaign("occupancy", &whole, bound, |bytes| OccupancyGrid::from_bytes(bytes).map(drop), |error| clear(error, "`"));
     let rest = &whole[0][64..];
@@ -415,12 +415,12 @@ fn campaign_configurations() {
     campaign("configuration", &whole, JSON, parse, |error| clear(error, ""));
 }
 
-/// An object of one member takes 7 bytes of a document and some 600 of memory.
+/// An object of one member takes 7 bytes of a document and about 600 of memory.
 const JSON: Bound = Bound { times: 256, plus: 1 << 16 };
 
-/// What says that it holds more than there is.
+/// Files that announce more than they contain.
 #[test]
-fn files_announcing_huge_sizes_are_refused() {
+fn files_announcing_huge_sizes_are_errors() {
     let folder = tempfile::tempdir().unwrap();
     let refused =
         |what: &str, bytes: &[u8], name: &str, bound: Bound, parse: &(dyn Fn(&Path) -> Result<(), String> + Sync)| {
@@ -433,7 +433,7 @@ fn files_announcing_huge_sizes_are_refused() {
             });
         };
     let photo = |path: &Path| said(Photo::open(path, None)).map(drop);
-    // What is said to have more pixels than its bytes can hold is not decoded at all.
+    // An image with more pixels than its bytes can hold is not decoded.
     let little = Bound { times: 64, plus: 1 << 20 };
     for [width, height] in [[65535, 65535], [16384, 16384], [1 << 31, 1], [12000, 12000]] {
         refused("PNG", &deep_png(width, height, &[0; 64]), "a.png", little, &photo);
@@ -478,7 +478,7 @@ fn files_announcing_huge_sizes_are_refused() {
     }
 }
 
-/// An archive of an array of 16 megabytes of zeros, which says that these are so many bytes.
+/// An archive of 16 megabytes of zeros that claims this size.
 fn bomb(said: u32) -> Vec<u8> {
     let mut npy = format!("\u{93}NUMPY{:118}", "").chars().map(|c| c as u8).collect::<Vec<u8>>();
     npy.resize(1 << 24, 0);

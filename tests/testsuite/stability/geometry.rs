@@ -7,7 +7,7 @@ use raygrad::{Scalar, Tape};
 
 const UNIT: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
 
-/// A ray whose numbers the type holds.
+/// A ray with numbers rounded to the type.
 fn ray<T: Scalar>(origin: [f64; 3], direction: [f64; 3]) -> Ray {
     Ray { origin: origin.map(round::<T>).into(), direction: direction.map(round::<T>).into() }
 }
@@ -22,7 +22,7 @@ fn rays_along_the_axes_of_a_box<T: Scalar>() {
                     let (mut o, mut d) = ([0.0; 3], [zero; 3]);
                     (o[axis], o[(axis + 1) % 3], o[(axis + 2) % 3]) = (along, p, q);
                     d[axis] = sign;
-                    // Between the faces, and the box not wholly behind.
+                    // A hit: between the faces, unless the box is entirely behind.
                     let hits = p.abs() <= 1.0 && q.abs() <= 1.0 && sign * along <= 1.0;
                     let expected = hits.then(|| [f64::max(0.0, -1.0 - sign * along), 1.0 - sign * along]);
                     assert_eq!(intersect_box(&ray::<T>(o, d), UNIT), expected, "{o:?} {d:?}");
@@ -30,7 +30,7 @@ fn rays_along_the_axes_of_a_box<T: Scalar>() {
             }
         }
     }
-    // The document's: the naive formula gives NaN for the first, and a miss for the second.
+    // The cases of the document: the naive formula gives NaN for the first and a miss for the second.
     for zero in [0.0, -0.0, 1e-40, -1e-40] {
         let got = intersect_box(&ray::<T>([0.0, 0.0, -3.0], [zero, 0.0, 1.0]), UNIT);
         assert_eq!(got, Some([2.0, 4.0]), "{zero:e}");
@@ -48,7 +48,7 @@ fn rays_along_the_axes_of_a_box<T: Scalar>() {
 }
 
 /// Matrix: slabs are symmetric in axis and sign, and agree with a search along the ray.
-fn boxes_are_the_same_from_every_side<T: Scalar>() {
+fn box_intersection_is_symmetric<T: Scalar>() {
     let mut random = noise(3);
     let mut hits = 0;
     for _ in 0..500 {
@@ -66,7 +66,7 @@ fn boxes_are_the_same_from_every_side<T: Scalar>() {
                 assert_eq!(intersect_box(&other, UNIT), expected);
             }
         }
-        // The part of a fine comb of points that is in the box.
+        // The points in the box of a fine comb along the ray.
         let inside: Vec<f64> =
             (0..20_000).map(|i| i as f64 * 1e-3).filter(|&t| base.at(t).abs().max_element() <= 1.0).collect();
         match expected {
@@ -143,7 +143,7 @@ fn contraction_is_smooth_and_bounded<T: Scalar>() {
             (0..3).for_each(|k| within("direction", y[k], largest[k], 4.0 * T::EPSILON));
         }
     }
-    // Across the ray a step is scaled as the radius is, along it as 1 / r^2.
+    // Across the ray a step scales with the radius; along it, with 1 / r^2.
     let (_, slopes) = at([0.0, 4.0, 0.0]);
     within("across", slopes[0], 1.75 / 4.0, tolerance);
     within("along", slopes[4], 1.0 / 16.0, tolerance);
@@ -166,7 +166,7 @@ fn normalised_device_coordinates<T: Scalar>() {
         assert_eq!(cube, [0.625, 0.25, 0.0], "what is nearer than the near plane, or behind, is seen at it: {z}");
         assert_eq!(grad, [0.5, 0.5, 0.0], "{z}");
     }
-    // At the near plane places stay, exactly.
+    // Points at the near plane stay exactly.
     assert_eq!(at([0.25, -0.5, -1.0])[0], [0.625, 0.25, 0.0]);
     let tolerance = by_type::<T>(2e-7, 1e-14);
     for (cube, name) in at([0.6, -0.2, -7.0])[0].iter().zip(["x", "y", "z"]) {
@@ -184,7 +184,7 @@ fn lenses<T: Scalar>() {
     let lens = |k1: f64| Lens::Brown { k: [round::<T>(k1), 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
     let undone = |lens: Lens, r: f64| lens.direction([round::<T>(r), 0.0]).map(|direction| direction.x / direction.z);
     let (barrel, pincushion) = (lens(-0.5), lens(0.5));
-    // Near the fold the slope is small: rounding .54 to f32 shows 7 times larger.
+    // Near the fold the slope is small: rounding 0.54 to f32 is amplified 7 times.
     let r = undone(barrel, 0.54).unwrap();
     within("k1 = -.5, .54", r, constant("undistorted .54 for k1 = -.5"), by_type::<T>(1e-6, 1e-14));
     assert!(undone(barrel, 0.5443).is_some());
@@ -205,7 +205,7 @@ fn lenses<T: Scalar>() {
 
 both!(
     rays_along_the_axes_of_a_box,
-    boxes_are_the_same_from_every_side,
+    box_intersection_is_symmetric,
     directions_of_vectors_of_every_size,
     contraction_is_smooth_and_bounded,
     normalised_device_coordinates,

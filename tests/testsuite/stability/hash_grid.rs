@@ -10,7 +10,7 @@ fn grid(size: usize) -> HashGrid {
     HashGrid::new(&HashGridConfig { levels: 1, features: 2, log2_table: 14, coarsest: size, finest: size }).unwrap()
 }
 
-/// The first feature at each point of a row of points along one axis, and its slope along that axis.
+/// The first feature at points along one axis, and its slope along that axis.
 fn along<T: Scalar>(grid: &HashGrid, table: &Tensor<T>, axis: usize, x: &[f64]) -> [Vec<f64>; 2] {
     let tape = Tape::new();
     let points: Vec<f64> = x
@@ -59,8 +59,8 @@ fn values_are_continuous_and_slopes_one_sided<T: Scalar>() {
                 for k in [0, 2] {
                     within(&format!("N {size}, cell {cell}"), y[k], y[1], most * 2.0 * step + 4.0 * T::EPSILON);
                 }
-                // A quarter of a cell from the border in its own cell, the interpolation is linear. The place within a
-                // cell has an error of half an ULP of x N.
+                // A quarter of a cell from the border, the interpolation is linear. The position within a cell has an
+                // error of half an ULP of x N.
                 let error = 4.0 * most * size as f64 * ulp::<T>(1.0) + 8.0 * T::EPSILON * size as f64;
                 for (side, sign) in [(3, -1.0), (4, 1.0)] {
                     let difference = (y[side] - y[1]) / (sign * quarter);
@@ -92,9 +92,9 @@ fn outside_and_nan<T: Scalar>() {
 
 both!(weights_sum_to_one_everywhere, values_are_continuous_and_slopes_one_sided, outside_and_nan);
 
-/// Catalogue: the place in a cell is off by 3.9e-3 at N = 65536 in f32, so that is the most there is.
+/// Catalogue: the position in a cell is off by 3.9e-3 at N = 65536 in f32, so that is the maximum.
 #[test]
-fn finer_grids_are_refused() {
+fn finer_grids_are_errors() {
     let config = HashGridConfig { levels: 1, features: 2, log2_table: 14, coarsest: 65_537, finest: 65_537 };
     assert!(HashGrid::new(&config).unwrap_err().to_string().starts_with("`finest`"));
 }

@@ -1,4 +1,4 @@
-//! New fields: whether there is anything to learn from.
+//! New fields have gradients to learn from.
 
 use super::support::noise;
 use raygrad::nerf::InstantConfig;
@@ -30,12 +30,12 @@ fn alive_share(model: &Model<f32>) -> f64 {
 
 /// Matrix: of 100 seeds, all have a density gradient at more than 1 % of random points. Catalogue: ReLU density.
 #[test]
-fn a_hundred_seeds_of_every_preset_are_alive() {
+fn presets_have_gradients_for_100_seeds() {
     let data = embedded(Split::Val, 8);
     let extent = SceneBox::new(data.bounds, [data.near, data.far]);
     for preset in [Preset::Small, Preset::Classic, Preset::Instant] {
         let mut least = 1.0_f64;
-        // The paper's network is large: fewer of them take as long.
+        // The paper's network is large: fewer seeds take as long.
         let seeds = if preset == Preset::Classic { 10 } else { 100 };
         let config = match preset {
             Preset::Instant => small_table(Config::preset(preset)),
@@ -48,7 +48,7 @@ fn a_hundred_seeds_of_every_preset_are_alive() {
     }
 }
 
-/// A table that is quick to fill.
+/// A table that is quick to initialise.
 fn small_table(mut config: Config) -> Config {
     if let Some(field) = config.field.get_mut::<InstantConfig>() {
         (field.grid.log2_table, field.grid.levels) = (10, 4);
@@ -56,9 +56,9 @@ fn small_table(mut config: Config) -> Config {
     config
 }
 
-/// A ReLU density may be dead; a trainer that is given one finds another seed.
+/// A ReLU density may be dead; the trainer then tries other seeds.
 #[test]
-fn a_trainer_starts_with_a_living_field() {
+fn trainer_starts_with_a_density_gradient() {
     let data = Arc::new(embedded(Split::Val, 8));
     for seed in 0..10 {
         let config = Config { seed, ..Config::preset(Preset::Small) }.with_relu_density();

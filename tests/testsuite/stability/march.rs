@@ -1,11 +1,11 @@
-//! Marching: equal steps and cones. Marching is f32 alone; the rays come in either precision.
+//! Marching with uniform steps and cones. Marching is f32 alone; rays come in either precision.
 
 use super::support::*;
 use raygrad::nerf::Jitter;
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::space::occupancy::{MAX_STEPS, MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
 
-/// The samples of a ray from the origin along z in a box around it that is wide enough, all of it occupied.
+/// The samples of a ray from the origin along z in an occupied box that is wide enough.
 fn march(span: [f64; 2], step: Step) -> MarchBuffer {
     let reach = span[1].abs() * 2.0 + 1.0;
     let config = OccupancyConfig { resolution: 16, ..OccupancyConfig::default() };
@@ -15,20 +15,20 @@ fn march(span: [f64; 2], step: Step) -> MarchBuffer {
     out
 }
 
-/// The step of fast trainers: the diagonal of the unit cube in 1024 parts.
+/// The step of fast trainers: 1/1024 of the diagonal of the unit cube.
 const DT: f32 = 1.691_456e-3;
 
 /// Matrix: march from t0 = 0, 2, 1e3, 32768, 1e6, with steps shorter than an ULP. Catalogue: `t += dt`.
 #[test]
-fn samples_lie_where_they_should_at_any_distance() {
+fn march_samples_are_exact_at_any_distance() {
     for t0 in [0.0, 2.0, 1e3, 32768.0, 1e6] {
         let out = march([t0, t0 + 3.0], Step::uniform(DT));
-        // As many as fit, a sample more or less at either end, where whole ULPs are lost or won.
+        // All samples that fit, up to one at either end, where whole ULPs are lost or gained.
         let expected = 3.0 / f64::from(DT);
         let slack = 1.0 + 2.0 * ulp::<f32>(t0) / f64::from(DT);
         within(&format!("number of samples from {t0}"), out.t.len() as f64, expected, slack);
         assert!(out.t.is_sorted() && out.t[0] >= t0 as f32 && out.t.iter().all(|&t| t <= t0 as f32 + 3.0));
-        // Sample i of those that the ray has, the first of which is half a step behind t0.
+        // Sample i of the ray; the first is half a step behind t0.
         for (i, &t) in out.t.iter().enumerate() {
             let exact = t0 + (i as f64 + 0.5) * f64::from(DT);
             within(&format!("sample {i} from {t0}"), t.into(), exact, ulp::<f32>(exact));
@@ -36,9 +36,9 @@ fn samples_lie_where_they_should_at_any_distance() {
     }
 }
 
-/// Every march ends: steps far below an ULP, spans that are endless, rays that are not finite.
+/// Marches end for steps far below an ULP, endless spans and non-finite rays.
 #[test]
-fn every_march_ends() {
+fn marches_always_end() {
     let out = march([1e6, 1e6 + 1.0], Step::uniform(1e-30));
     assert!(out.t.len() <= MAX_STEPS + 32 && out.t.iter().all(|&t| (1e6..=1e6 + 1.0).contains(&t)));
     for span in [[0.0, f64::INFINITY], [f64::INFINITY, f64::INFINITY], [f64::NAN, 1.0], [0.0, f64::NAN], [5.0, 1.0]] {
@@ -60,7 +60,7 @@ fn every_march_ends() {
 
 /// Matrix: cone stepping with c = 0, 1e-6, 1/256, 1.
 #[test]
-fn a_cone_widens_evenly_and_a_narrow_one_is_uniform() {
+fn cone_steps_grow_and_tend_to_uniform() {
     for cone in [1e-6, 1.0 / 256.0, 1.0] {
         for near in [0.0, 2.0, 1e3] {
             let step = Step { length: 0.01, cone, max_samples: usize::MAX };
@@ -72,7 +72,7 @@ fn a_cone_widens_evenly_and_a_narrow_one_is_uniform() {
                 let exact = start + (length + c * start) * (i as f64 * c.ln_1p()).exp_m1() / c;
                 within(&format!("cone {cone} from {near}, sample {i}"), t.into(), exact, 2.0 * ulp::<f32>(exact));
             }
-            // The intervals are those between whole steps from the entry, and so they follow each other.
+            // The intervals are between whole steps from the entry, so they are adjacent.
             let total: f64 = out.delta.iter().map(|&d| f64::from(d)).sum();
             let exact = (length + c * near) * (out.t.len() as f64 * c.ln_1p()).exp_m1() / c;
             near_by(total, exact);

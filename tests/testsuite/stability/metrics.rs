@@ -20,7 +20,7 @@ fn identical_and_nearly_identical_images() {
     assert!(ssim(&a, &b) <= 1.0 && ssim(&a, &b) > 1.0 - 1e-9);
     let step = f64::from(0.6_f32 + 1e-7) - f64::from(0.6_f32);
     within("psnr", psnr(&a, &b), -20.0 * step.log10(), 1e-9);
-    // Catalogue: E[x^2] - mu^2 at .9 is negative in 36 % of the windows at a noise of 1e-5.
+    // Catalogue: E[x^2] - mu^2 at 0.9 is negative in 36 % of the windows at a noise of 1e-5.
     for scale in [1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2] {
         let noisy = image(32, |_| 0.9 + scale * (random() as f32 - 0.5));
         let flat = image(32, |_| 0.9);
@@ -29,7 +29,7 @@ fn identical_and_nearly_identical_images() {
     }
 }
 
-/// Matrix: images in the range 255 give what images in the range 1 give.
+/// Matrix: images in the range 255 give the same values as images in the range 1.
 #[test]
 fn range_255_equals_range_1() {
     let mut random = noise(8);
@@ -59,7 +59,7 @@ fn range_255_equals_range_1() {
     within("ssim", ssim(&a, &b), sum / (14.0 * 14.0 * 3.0), 1e-6);
 }
 
-/// Catalogue: the mean of PSNRs is not the PSNR of the mean, and 8 bits have a ceiling; MSE over 1.92 million pixels.
+/// Catalogue: the mean of PSNRs is not the PSNR of the mean, 8 bits limit the PSNR, and MSE over 1.92 million pixels.
 #[test]
 fn means_ceilings_and_large_images() {
     let [a, b] = [20.0, 40.0].map(|psnr: f64| 10.0_f64.powf(-psnr / 10.0));
@@ -74,9 +74,9 @@ fn means_ceilings_and_large_images() {
     near::<f32>("1.92 million values", mse(&a, &b), 1e-4, 1e-6);
 }
 
-/// A single NaN is no good score.
+/// A single NaN makes the metric NaN.
 #[test]
-fn nan_shows() {
+fn metrics_of_one_nan_are_nan() {
     let (good, mut bad) = (image(16, |_| 0.5), image(16, |_| 0.5));
     bad.data[77] = f32::NAN;
     assert!(psnr(&good, &bad).is_nan() && ssim(&good, &bad).is_nan());

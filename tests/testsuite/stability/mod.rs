@@ -1,7 +1,7 @@
-//! The stress suite: where floating point fails, and what is right there.
+//! The stress suite: inputs at which floating point fails, with the right results.
 //!
-//! Each module holds the rows of the stress matrix and of the failure catalogue that belong together, in f32 and f64
-//! (`single::` and `double::`), through the public interface. Expected values that are not plain come from
+//! Each module has the related rows of the stress matrix and of the failure catalogue, in f32 and f64 (`single::` and
+//! `double::`), through the public interface. Expected values that are not obvious come from
 //! `reference/constants.json`, which `reference/constants.py` computes with 50 digits. docs/library/numerics.md lists
 //! the rows of each module, and the failures that each guard prevents.
 

@@ -5,10 +5,10 @@ use raygrad::{Adam, AdamConfig, AdamW, Gradient, Optimizer, Params, Scalar, Sgd,
 
 const TABLE: AdamConfig = AdamConfig { beta1: 0.9, beta2: 0.99, eps: 1e-15 };
 
-/// The most that a step can be, in learning rates: by Cauchy and Schwarz, `m^2 <= v sum (1-b1)^2 b1^2k / ((1-b2) b2^k)`.
+/// The largest step in learning rates, by Cauchy and Schwarz: `m^2 <= v sum (1-b1)^2 b1^2k / ((1-b2) b2^k)`.
 ///
-/// That is more than the customary `max(1, (1-b1) / sqrt(1-b2))`, which holds for gradients of one size or a single one:
-/// 7.27 for the default constants instead of 3.16, and 2.35 instead of 1 for those of tables.
+/// It exceeds the customary `max(1, (1-b1) / sqrt(1-b2))`, which holds for gradients of equal size or a single one:
+/// 7.27 instead of 3.16 for the default constants, and 2.35 instead of 1 for those of tables.
 pub fn bound(config: &AdamConfig) -> f64 {
     let AdamConfig { beta1, beta2, .. } = *config;
     let q = beta1 * beta1 / beta2;
@@ -34,23 +34,23 @@ fn lazy_store<T: Scalar>(shape: &[usize]) -> Params<T> {
     params
 }
 
-/// A gradient of a table that is zero but in one row.
+/// A gradient of a table that is zero except in one row.
 fn row_of<T: Scalar>(shape: &[usize], row: usize, g: f64) -> Tensor<T> {
     Tensor::from_fn(shape, |i| if i / shape[1] == row { T::from_f64(g) } else { T::ZERO })
 }
 
-/// A step of that parameter; returns how many elements were left alone.
+/// Takes a step; returns the number of elements that did not change.
 fn step<T: Scalar>(adam: &mut dyn Optimizer<T>, params: &mut Params<T>, gradient: Tensor<T>, rate: f64) -> usize {
     adam.update(params, &[Gradient::from(gradient)], rate).skipped
 }
 
-/// The way of each element in each of the steps with these gradients.
+/// The change of each element in each step with these gradients.
 fn ways<T: Scalar>(config: AdamConfig, gradients: &[Vec<f64>], rate: f64) -> Vec<Vec<f64>> {
     let n = gradients[0].len();
     let mut adam = Adam::<T>::new(config);
     let mut x = store(Tensor::zeros(&[n]));
     let way = |gradient: &Vec<f64>| {
-        // From 0 each time, so that small steps keep their digits.
+        // From 0 each time, so that small steps are precise.
         x.values_mut()[0].as_mut_slice().fill(T::ZERO);
         step(&mut adam, &mut x, vector(gradient), rate);
         numbers(&x.values()[0])
@@ -80,7 +80,7 @@ fn first_steps<T: Scalar>() {
     }
 }
 
-/// No gradient of any size makes a step longer than the bound, in no order and after no pause.
+/// No gradients of any sizes, in any order and after any pause, make a step longer than the bound.
 fn no_step_is_longer_than_the_bound<T: Scalar>() {
     let sizes =
         [1e-38, 1e-30, 1e-20, 3e-16, 1e-15, 3e-15, 1e-14, 1e-12, 1e-8, 1e-4, 1.0, 1e8, 1e18, 1e19, 1e20, 1e30, 1e38];
@@ -106,7 +106,7 @@ fn no_step_is_longer_than_the_bound<T: Scalar>() {
     }
 }
 
-/// The document's bound is not one: gradients that grow as fast as `b2 / b1` reach the bound by Cauchy and Schwarz.
+/// The document's bound does not hold: gradients that grow by `b2 / b1` attain the bound by Cauchy and Schwarz.
 fn growing_gradients_reach_the_bound<T: Scalar>() {
     for (config, name) in [(AdamConfig::default(), "default"), (TABLE, "table's")] {
         let growth = config.beta2 / config.beta1;
@@ -122,8 +122,8 @@ fn growing_gradients_reach_the_bound<T: Scalar>() {
     }
 }
 
-/// An element that has once had a huge gradient moves on.
-fn a_huge_gradient_does_not_stop_an_element_for_ever<T: Scalar>() {
+/// An element recovers after a huge gradient.
+fn element_recovers_after_a_huge_gradient<T: Scalar>() {
     let config = AdamConfig { beta2: 0.9, ..AdamConfig::default() };
     let mut gradients = vec![vec![greatest::<T>()]];
     gradients.extend((0..10_000).map(|_| vec![1.0]));
@@ -142,7 +142,7 @@ fn bad_gradients_are_skipped_and_counted<T: Scalar>() {
         assert_eq!(step(&mut adam, &mut x, bad, 0.1), 3);
         let moved = numbers(&x.values()[0]);
         assert!(moved[..3] == [1.0; 3] && (moved[3] - 0.9).abs() < 1e-6, "{moved:?}");
-        // Nothing of them is remembered.
+        // The moments do not keep them.
         step(&mut adam, &mut x, table(&[0.0; 4]), 0.1);
         assert_eq!(numbers(&x.values()[0])[..3], [1.0; 3]);
     }
@@ -175,12 +175,12 @@ fn a_hundred_thousand_steps_without_gradient<T: Scalar>() {
             }
             last = now;
         }
-        // Without decay everything comes to rest, once the momentum is flushed.
+        // Without decay everything stops once the momentum is flushed.
         assert!(k == 2 || rest.is_some_and(|step| step < 2000), "optimiser {k} comes to rest at {rest:?}");
     }
 }
 
-/// Matrix: Adam at t = 1e7. The corrections have no more to say, and a constant gradient is a step of 1.
+/// Matrix: Adam at t = 1e7. The bias corrections are 1, and a constant gradient gives a step of 1.
 #[test]
 fn ten_million_steps() {
     let mut adam = Adam::<f32>::new(AdamConfig::default());
@@ -200,7 +200,7 @@ fn ten_million_steps() {
     assert_eq!(adam.steps(), 10_000_000);
 }
 
-/// Matrix: lazy Adam with a gradient every k steps: the documented recurrence, in which a row counts its own steps.
+/// Matrix: lazy Adam with a gradient every k steps: the documented recurrence, in which each row counts its own steps.
 fn lazy_adam_with_pauses<T: Scalar>() {
     for every in [1, 3, 10] {
         for config in [AdamConfig::default(), TABLE] {
@@ -229,7 +229,7 @@ fn lazy_adam_with_pauses<T: Scalar>() {
             assert!(numbers(&table.values()[0]).iter().enumerate().all(|(i, x)| i == 9 || *x == 0.0));
         }
     }
-    // One late gradient: a lazy row moves by one learning rate, where dense Adam moves by this many in all.
+    // One late gradient: a lazy row moves by one learning rate; dense Adam moves by this many in total.
     let mut late = vec![vec![0.0]; 2000];
     late.push(vec![1.0]);
     late.extend(vec![vec![0.0]; 2000]);
@@ -262,7 +262,7 @@ both!(
     first_steps,
     no_step_is_longer_than_the_bound,
     growing_gradients_reach_the_bound,
-    a_huge_gradient_does_not_stop_an_element_for_ever,
+    element_recovers_after_a_huge_gradient,
     bad_gradients_are_skipped_and_counted,
     a_hundred_thousand_steps_without_gradient,
     lazy_adam_with_pauses,

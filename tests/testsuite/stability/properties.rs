@@ -13,7 +13,7 @@ use raygrad::nerf::{
 };
 use raygrad::{Adam, AdamConfig, Op, Optimizer, Params, Scalar, Segments, Tape, Tensor, Var};
 
-/// A finite number of any magnitude that f32 has, evenly over the exponents, or a zero of either sign.
+/// A finite f32 number of any magnitude, uniform in the exponent, or a zero of either sign.
 fn any_finite() -> impl Strategy<Value = f64> {
     let sign = prop::bool::ANY.prop_map(|negative| if negative { -1.0 } else { 1.0 });
     prop_oneof![
@@ -27,7 +27,7 @@ fn any_finite() -> impl Strategy<Value = f64> {
     ]
 }
 
-/// Any number at all.
+/// Any number.
 fn any_number() -> impl Strategy<Value = f64> {
     prop_oneof![8 => any_finite(), 1 => Just(f64::INFINITY), 1 => Just(f64::NEG_INFINITY), 1 => Just(f64::NAN)]
 }
@@ -46,7 +46,7 @@ macro_rules! in_both {
 
 type Outcome = Result<(), TestCaseError>;
 
-/// Weights lie in 0..=1 and add up, and the gradient of finite inputs is finite where the truth fits the type.
+/// Weights are in 0..=1 and sum up, and gradients are finite for finite inputs unless the exact value overflows.
 fn compositing<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64], log: bool) -> Outcome {
     let n = sigma.len();
     let tape = Tape::new();
@@ -68,7 +68,7 @@ fn compositing<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64], log: boo
     prop_assert!((-1e-7..=1.0 + 1e-6).contains(&values[0]), "{values:?}");
     let grads = out.slice_axis(1, ..1).sum().grad(&[&density, &features]);
     prop_assert!(grads.iter().all(Tensor::is_finite), "{grads:?}");
-    // And by way of plain operations, once more differentiated, where nothing overflows in truth.
+    // And by plain operations, differentiated twice, where nothing overflows.
     if delta.iter().all(|&d| d < 1e3) && sigma.iter().all(|&s| s < 20.0) {
         let first = volume::weights(&tape.apply(op(), &[&density]), &segments).sum().grad_graph(&[&density]).remove(0);
         prop_assert!(first.value().is_finite());
@@ -77,14 +77,14 @@ fn compositing<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64], log: boo
     Ok(())
 }
 
-/// Activations are monotone, bounded and have finite gradients.
+/// Activations are monotone and bounded, with finite gradients.
 fn activations<T: Scalar>(a: f64, b: f64) -> Outcome {
     let (low, high) = (round::<T>(a.min(b)), round::<T>(a.max(b)));
     let tape = Tape::new();
     let x = tape.leaf(vector::<T>(&[low, high, -low]));
     let (s, p) = (x.sigmoid(), x.softplus());
     let (s_values, p_values) = (numbers(s.value()), numbers(p.value()));
-    // Two units in the last place for the functions' own rounding.
+    // Two ULPs for the functions' own rounding.
     let (more, less) = (1.0 + 2.0 * T::EPSILON, 1.0 - 2.0 * T::EPSILON);
     prop_assert!(s_values[0] <= s_values[1] * more && s_values.iter().all(|s| (0.0..=1.0).contains(s)));
     prop_assert!((s_values[0] + s_values[2] - 1.0).abs() <= 2.0 * T::EPSILON);
@@ -96,7 +96,7 @@ fn activations<T: Scalar>(a: f64, b: f64) -> Outcome {
     Ok(())
 }
 
-/// Directions are of length 1, contracted points in the ball of radius 2, codes finite: with finite gradients.
+/// Directions have length 1, contracted points are in the ball of radius 2, and codes are finite; gradients are finite.
 fn points<T: Scalar>(point: [f64; 3]) -> Outcome {
     let point = point.map(|x| round::<T>(x).clamp(-greatest::<T>(), greatest::<T>()));
     let tape = Tape::new();
@@ -118,13 +118,13 @@ fn points<T: Scalar>(point: [f64; 3]) -> Outcome {
     Ok(())
 }
 
-/// A rotation vector of any direction and any angle that still has digits gives a rotation.
+/// A rotation vector of any direction, and of any angle that has digits, gives a rotation.
 fn rotations<T: Scalar>(vector: [f64; 3]) -> Outcome {
     let vector = vector.map(|x| round::<T>(x).clamp(-100.0, 100.0));
     let tape = Tape::new();
     let x = tape.leaf(tensor::<T>(&[1, 3], &vector));
     let matrix = rotation_exp(&x);
-    // The angle is off by as much as its square is, times the angle.
+    // The angle's error is that of its square times the angle.
     let angle = vector.iter().map(|x| x * x).sum::<f64>().sqrt();
     let skew = skewness(&numbers(matrix.value()));
     prop_assert!(skew <= by_type::<T>(1e-6, 3e-15) * (1.0 + angle), "{:e}", skew);
@@ -162,7 +162,7 @@ fn distorted<T: Scalar>(weights: &[f64], gaps: &[f64]) -> Outcome {
     Ok(())
 }
 
-/// The places in a grid's cube or outside of it never read out of bounds, and weights add up.
+/// Positions in the grid's cube or outside of it never read out of bounds, and weights sum to 1.
 fn grid_cells<T: Scalar>(points: &[[f64; 3]]) -> Outcome {
     let config = HashGridConfig { levels: 4, features: 1, log2_table: 8, coarsest: 2, finest: 65_536 };
     let grid = HashGrid::new(&config).unwrap();
@@ -284,7 +284,7 @@ proptest! {
         let camera = |eye: [f64; 3], d: [f64; 3]| {
             Camera::from_angle(40, 30, 0.8, Camera::look_at(eye.into(), DVec3::from(eye) + DVec3::from(d), DVec3::Z))
         };
-        // Not far from each other, for their size: most are no picture, and none panics.
+        // Close to each other, relative to their size. Most are not forward-facing, and none panics.
         let beside = [o[0], o[1] * (1.0 + 1e-3), o[2]];
         if let Ok(ndc) = Ndc::around(&[camera(o, d), camera(beside, d)], r.abs()) {
             prop_assert!(ndc.slopes.iter().all(|slope| (0.1..10.0).contains(slope)), "{:?}", ndc);

@@ -15,13 +15,13 @@ const AXES: [[f64; 3]; 6] = [
     [2.0 / 3.0, -1.0 / 3.0, 2.0 / 3.0],
 ];
 
-/// Of a vector, for its differences.
+/// The step of a vector for differences.
 const STEP: f64 = 1e-5;
 
-/// The rotation matrix of an axis and an angle, row by row, by the textbook formula in f64.
+/// The row-major rotation matrix of an axis and an angle, by the textbook formula in f64.
 fn textbook([x, y, z]: [f64; 3], angle: f64) -> [f64; 9] {
     let (s, c) = angle.sin_cos();
-    // 1 - cos, with its digits.
+    // 1 - cos, without cancellation.
     let v = 2.0 * (0.5 * angle).sin().powi(2);
     [
         c + x * x * v,
@@ -70,8 +70,8 @@ fn exponential_at_every_angle<T: Scalar>() {
     }
 }
 
-/// Catalogue: (1 - cos t) / t^2 at 1e-4 is .5, and not 0: seen in how a small rotation moves a point.
-fn small_angles_keep_their_second_order<T: Scalar>() {
+/// Catalogue: (1 - cos t) / t^2 at 1e-4 is 0.5, not 0: a small rotation moves a point by it.
+fn small_angles_have_their_second_order_term<T: Scalar>() {
     let angle = 1e-4;
     let tape = Tape::new();
     let leaf = tape.leaf(tensor::<T>(&[1, 3], &[angle, angle, 0.0]));
@@ -81,4 +81,4 @@ fn small_angles_keep_their_second_order<T: Scalar>() {
     within("b", b, constant("(1 - cos t) / t^2 at 1e-4"), by_type::<T>(1e-6, 1e-8));
 }
 
-both!(exponential_at_every_angle, small_angles_keep_their_second_order);
+both!(exponential_at_every_angle, small_angles_have_their_second_order_term);

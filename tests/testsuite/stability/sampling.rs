@@ -24,7 +24,7 @@ fn weights_of_every_size<T: Scalar>() {
         let out = inverted::<T>(&[zero; 7], 0.01, &u);
         assert!(out.iter().zip(&u).all(|(x, u)| (x - u).abs() < 1e-12), "zero weights: uniform");
     }
-    // Proportions matter, sizes do not: down to the smallest number and up to the largest.
+    // Only proportions matter, from the smallest number to the largest.
     let shape = [1.0, 0.0, 3.0, 2.0, 0.0, 2.0];
     let expected = inverted::<T>(&shape, 0.05, &u);
     for scale in [1e-30, 1e30, 0.25 * greatest::<T>(), 1e20 * smallest::<T>()] {
@@ -55,20 +55,20 @@ fn ends_and_ties<T: Scalar>() {
         let out = inverted::<T>(&weights, 0.01, &[0.0, last, 1.0]);
         assert!(out[0] == 0.0 && out[1] < 1.0 && out[1] > 1.0 - 1e-5 && out[2] <= 1.0, "{n} bins: {out:?}");
     }
-    // The CDF is .25, .25, .25, 1: at a tie the bins without mass are passed.
+    // The CDF is 0.25, 0.25, 0.25, 1: at a tie bins without mass are skipped.
     let out = inverted::<T>(&[1.0, 0.0, 0.0, 3.0], 0.0, &[0.0, 0.25 - 1e-12, 0.25, 0.25 + 1e-12, last]);
     assert!(out.is_sorted() && out[1] <= 0.25 && out[2] >= 0.75 && out[4] <= 1.0, "{out:?}");
     let out = inverted::<T>(&[0.0, 0.0, 1.0], 0.0, &[0.0, 0.5, 1.0]);
     assert!((out[0] - 2.0 / 3.0).abs() < 1e-15 && (out[2] - 1.0).abs() < 1e-15, "{out:?}");
-    // A span of no length: every bin edge is the same.
+    // A span of length 0: all bin edges are equal.
     let rays = ray_along_z::<T>(0.0, [2.0, 2.0]);
     let coarse = stratified(&rays, 8, &mut Jitter::Middle, &Pool::new());
     let fine = importance_sampling(&rays, &coarse, &[T::ONE; 8], 8, 0.01, &mut Jitter::Middle, &Pool::new());
     assert!(numbers(&fine.t).iter().all(|&t| t == 2.0) && numbers(&fine.delta).iter().all(|&d| d == 0.0));
 }
 
-/// Catalogue: weights + 1e-5 make 38 % of a faint ray's samples uniform; a mixture says what it does.
-fn the_uniform_share_is_what_it_says<T: Scalar>() {
+/// Catalogue: weights + 1e-5 make 38 % of a faint ray's samples uniform; a mixture has an explicit share.
+fn uniform_share_is_exact<T: Scalar>() {
     let u = evenly(100_000);
     for (total, name) in [(1.0, "1"), (1e-3, "1e-3"), (1e-4, "1e-4"), (1e-30, "")] {
         let mut weights = [0.0; 62];
@@ -84,8 +84,8 @@ fn the_uniform_share_is_what_it_says<T: Scalar>() {
     }
 }
 
-/// NaN weights of one ray neither end a run nor touch another ray.
-fn a_ray_with_bad_weights_is_sampled_evenly<T: Scalar>() {
+/// NaN weights of one ray neither end a run nor affect another ray.
+fn ray_with_nan_weights_is_sampled_uniformly<T: Scalar>() {
     let mut rays = ray_along_z::<T>(0.0, [2.0, 6.0]);
     let second = ray_along_z::<T>(0.0, [2.0, 6.0]);
     rays.origins.extend(second.origins);
@@ -100,9 +100,4 @@ fn a_ray_with_bad_weights_is_sampled_evenly<T: Scalar>() {
     assert!(t[8..].iter().filter(|t| (3.0..=4.0).contains(*t)).count() == 5, "{t:?}");
 }
 
-both!(
-    weights_of_every_size,
-    ends_and_ties,
-    the_uniform_share_is_what_it_says,
-    a_ray_with_bad_weights_is_sampled_evenly
-);
+both!(weights_of_every_size, ends_and_ties, uniform_share_is_exact, ray_with_nan_weights_is_sampled_uniformly);

@@ -1,5 +1,5 @@
-//! Tape programs on shapes that may not fit: a message that says so, or a result with gradients, and no other panic. Shapes
-//! and values are those of ndarray where it has the operation.
+//! Tape programs on random shapes: a clear error, or a result with gradients, and no other panic. Shapes and values
+//! equal ndarray's where it has the operation.
 
 use ndarray::{ArrayD, Axis, IxDyn, Slice, concatenate, stack};
 use proptest::prelude::*;
@@ -12,10 +12,10 @@ use std::sync::Arc;
 
 type V<'t> = Var<'t, f64>;
 
-/// Operation number `op` of values and small numbers, some of them out of range.
+/// Operation number `op` on values and small numbers, some of them out of range.
 fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) -> Option<V<'t>> {
     let tape = a.tape();
-    // Places that may be counted from the end, and places from the start.
+    // Axes may count from the end, positions count from the start.
     let (axis, at) = (i as isize - 2, i as isize);
     let index: Arc<[u32]> = (0..j).map(|n| ((n * 3 + k) % 5) as u32).collect();
     let indices = || Indices::new(&[j], index.clone());
@@ -123,7 +123,7 @@ impl Einsum for V<'_> {
     }
 }
 
-/// What is not the tape's to refuse: inputs that constructors and plain tensors check. Any other panic is an accident: an
+/// Messages of invalid inputs that constructors and plain tensors check, not the tape. Any other panic is a bug: an
 /// index out of bounds, an overflow, an `unwrap`.
 const MESSAGES: [&str; 6] = [
     "one_hot: index",
@@ -134,12 +134,12 @@ const MESSAGES: [&str; 6] = [
     "the degree of spherical harmonics must be 1 to 4",
 ];
 
-/// Whether a panic is one that was written for a user.
+/// Returns true if a panic has a message for users.
 fn is_a_message(text: &str) -> bool {
     MESSAGES.iter().any(|words| text.contains(words))
 }
 
-/// What a panic says.
+/// The message of a panic.
 fn words(panic: Box<dyn Any + Send>) -> String {
     let text = panic.downcast_ref::<String>().cloned();
     text.or(panic.downcast_ref::<&str>().map(|text| text.to_string())).unwrap_or_default()
@@ -153,7 +153,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 6000, max_shrink_iters: 2000, ..ProptestConfig::default() })]
 
     #[test]
-    fn every_operation_on_any_shapes(
+    fn operations_on_any_shapes_give_results_or_errors(
         op in 0..OPERATIONS, a in shape(), b in shape(), c in shape(), alike in 0..4_usize, k in [0..5_usize, 0..5, 0..5],
     ) {
         // Independent shapes rarely fit; equal ones often do.
@@ -164,7 +164,7 @@ proptest! {
             let mut value = 0.0;
             let mut leaf = |shape: &[usize]| tape.leaf(Tensor::from_fn(shape, |_| { value += 0.37; 0.1 + value % 1.0 }));
             let [a, b, c] = [&a, &b, &c].map(|shape| leaf(shape));
-            // What does not fit is an error; what fits has gradients of any order.
+            // Invalid shapes are errors; results have gradients of any order.
             let Ok(y) = tape.try_run(|| apply(op, &a, &b, &c, k)) else { return };
             let Some(y) = y else { return };
             let first = y.tracked().sum().grad_graph(&[&a, &b, &c]);
@@ -178,7 +178,7 @@ proptest! {
     }
 }
 
-/// A reduced axis as ndarray counts it; `None` if there is none of that number.
+/// A reduced axis in ndarray's numbering; `None` if it is out of range.
 fn counted(axis: isize, x: &ArrayD<f64>) -> Option<Axis> {
     let ndim = x.ndim() as isize;
     let axis = if axis < 0 { axis + ndim } else { axis };
@@ -187,7 +187,7 @@ fn counted(axis: isize, x: &ArrayD<f64>) -> Option<Axis> {
 
 fn zipped(a: &ArrayD<f64>, b: &ArrayD<f64>, f: fn(f64, f64) -> f64) -> Option<ArrayD<f64>> {
     let shape = raygrad::tensor::broadcast_shape(&[a.shape(), b.shape()]);
-    // The common shape is ndarray's own: one of the two stretches as far as it must.
+    // The common shape is ndarray's; one of the two is broadcast.
     let sum = catch_unwind(AssertUnwindSafe(|| a + b)).ok();
     assert_eq!(shape.as_deref(), sum.as_ref().map(|sum| sum.shape()));
     let shape = sum?.raw_dim();
@@ -195,7 +195,7 @@ fn zipped(a: &ArrayD<f64>, b: &ArrayD<f64>, f: fn(f64, f64) -> f64) -> Option<Ar
     Some(ndarray::Zip::from(a).and(b).map_collect(|&a, &b| f(a, b)))
 }
 
-/// The product of matrices by ndarray, for each pair of a batch.
+/// ndarray's matrix product, for each pair of a batch.
 fn product(a: &ArrayD<f64>, b: &ArrayD<f64>) -> Option<ArrayD<f64>> {
     if a.ndim() != 2 || b.ndim() != 2 || a.shape()[1] != b.shape()[0] {
         return None;
@@ -204,14 +204,14 @@ fn product(a: &ArrayD<f64>, b: &ArrayD<f64>) -> Option<ArrayD<f64>> {
     Some(a.dot(&b).into_dyn())
 }
 
-/// What ndarray makes of operation number `op`, `None` if it must be refused; nothing for operations without a counterpart.
+/// ndarray's result of operation number `op`: `Some(None)` if it must be an error, `None` without a counterpart.
 fn by_ndarray(op: usize, x: [&ArrayD<f64>; 3], [i, j, k]: [usize; 3]) -> Option<Option<ArrayD<f64>>> {
     let [a, b, c] = x;
     let (axis, extent) = (i as isize - 2, a.shape().get(i).copied());
     let reduce = |f: &dyn Fn(Axis) -> ArrayD<f64>| counted(axis, a).map(f);
     let extreme = |pick: fn(f64, f64) -> f64| {
         let axis = counted(axis, a)?;
-        // An axis of nothing has no greatest element.
+        // An empty axis has no maximum.
         let rest: usize = a.shape().iter().enumerate().filter(|(i, _)| *i != axis.0).map(|(_, n)| n).product();
         let is_empty = a.len_of(axis) == 0 && rest > 0;
         (!is_empty).then(|| a.fold_axis(axis, f64::NAN, |&best, &x| if best.is_nan() { x } else { pick(best, x) }))
@@ -250,20 +250,20 @@ fn by_ndarray(op: usize, x: [&ArrayD<f64>; 3], [i, j, k]: [usize; 3]) -> Option<
     })
 }
 
-/// The operations that [`by_ndarray`] knows.
+/// The operations of [`by_ndarray`].
 const COMPARED: [usize; 19] = [0, 1, 2, 3, 9, 10, 11, 16, 23, 24, 26, 27, 28, 29, 30, 31, 36, 38, 39];
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 6000, max_shrink_iters: 2000, ..ProptestConfig::default() })]
 
     #[test]
-    fn shapes_and_values_are_those_of_ndarray(
+    fn shapes_and_values_equal_ndarray(
         op in prop::sample::select(&COMPARED[..]), a in shape(), b in shape(), c in shape(), alike in 0..4_usize,
         fits: bool, k in [0..5_usize, 0..5, 0..5],
     ) {
         let b = if alike >= 1 { a.clone() } else { b };
         let c = if alike >= 2 { a.clone() } else { c };
-        // Matrices that fit, which shapes by chance rarely do.
+        // Matrices that fit, which random shapes rarely do.
         let (a, b) = if op == 3 && fits { (vec![k[0], k[1]], vec![k[1], k[2]]) } else { (a, b) };
         let mut value = 0.0;
         let mut tensor = |shape: &[usize]| Tensor::from_fn(shape, |_| { value += 0.37; 0.1 + value % 1.0 });

@@ -1,4 +1,4 @@
-//! What is left out: empty cells, and what lies behind opaque samples.
+//! Skipping: empty cells, and samples behind opaque ones.
 
 use super::support::*;
 use raygrad::nerf::Jitter;
@@ -11,7 +11,7 @@ use raygrad::nerf::{Camera, Config, Density, Field, Model, Preset, Query, Sample
 use raygrad::{Bound, Params, Scalar, Segments, Tape, Tensor, Var};
 use std::sync::Arc;
 
-/// A fog of one density in a cube of +-1, black in the half in front (z < 0) and white behind, or all of one colour.
+/// A uniform fog in a cube of +-1. It is black in the front half (z < 0) and white behind, or of one colour.
 struct Fog {
     sigma: f64,
     white_behind: bool,
@@ -29,12 +29,12 @@ impl<T: Scalar> Field<T> for Fog {
     }
 }
 
-/// Matrix: early termination where T crosses the threshold exactly, with a background unlike the front, without
-/// renormalising: training's.
+/// Matrix: training's early termination at the exact threshold of T, with a background unlike the front, without
+/// renormalising.
 fn training_ends_rays_within_the_bound<T: Scalar>() {
     for (eps, steps) in [(0.25, 2), (0.125, 3), (1.0 / 1024.0, 10), (1e-3, 10), (1e-4, 13), (0.0, 5)] {
         for white_behind in [false, true] {
-            // Each step halves the light: after so many it is the power of two exactly.
+            // Each step halves the light, so T is a power of two exactly.
             let n = 40;
             let delta = 2.0_f64.ln();
             let rays = ray_along_z::<T>(-1.0, [0.0, 2.0]);
@@ -71,7 +71,7 @@ fn training_ends_rays_within_the_bound<T: Scalar>() {
 
 both!(training_ends_rays_within_the_bound);
 
-/// A model that is this fog, and a camera in front of it.
+/// A model of this fog, and a camera in front of it.
 fn fog_model(fog: Fog, skip: Skip) -> (Model<f32>, Camera) {
     let mut config = Config::preset(Preset::Voxel);
     if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
@@ -89,10 +89,10 @@ fn fog_model(fog: Fog, skip: Skip) -> (Model<f32>, Camera) {
     (model, Camera::from_angle(16, 16, 0.4, pose))
 }
 
-/// Matrix: early termination with renormalising: rendering's, at both levels, over both backgrounds.
+/// Matrix: early termination of renders, which renormalise, at both levels and over both backgrounds.
 #[test]
 fn rendering_ends_rays_within_the_bound() {
-    // What each level may leave out: light that is left, and colours of small weights.
+    // The losses allowed at each level: remaining light, and colours of small weights.
     for (skip, bound) in [(Skip::NearLossless, 1e-4 + 1e-4), (Skip::Fast, 1e-3 + 2e-3)] {
         for sigma in [0.05, 1.0, 4.0, 6.9, 30.0, 1e3, 1e30] {
             for white_behind in [false, true] {
@@ -115,9 +115,9 @@ fn rendering_ends_rays_within_the_bound() {
     }
 }
 
-/// The light that would have gone on stays with what is in front: a white body over black is white, not 1 - 1e-3.
+/// The remaining light is attributed to the samples in front: a white body over black is white, not 1 - 1e-3.
 #[test]
-fn a_ray_that_ends_early_has_the_whole_colour() {
+fn early_terminated_ray_has_the_full_colour() {
     for skip in [Skip::NearLossless, Skip::Fast] {
         let (mut model, camera) = fog_model(Fog { sigma: 10.0, white_behind: false }, skip);
         model.finish();
@@ -127,9 +127,9 @@ fn a_ray_that_ends_early_has_the_whole_colour() {
     }
 }
 
-/// Catalogue: sum w = 0. A pixel that shows nothing has the depth 0, and no NaN.
+/// Catalogue: sum w = 0. An empty pixel has the depth 0, not NaN.
 #[test]
-fn the_depth_of_nothing_is_zero() {
+fn depth_of_an_empty_pixel_is_zero() {
     for sigma in [0.0, 1e-30, 1e-6] {
         let (model, camera) = fog_model(Fog { sigma, white_behind: true }, Skip::Off);
         let picture = model.render(&camera, [1.0; 3]);
@@ -138,10 +138,10 @@ fn the_depth_of_nothing_is_zero() {
     }
 }
 
-/// Matrix: occupancy with a fog of sigma dt = .0099 in every cell: nothing of it is lost, neither in training, nor when
-/// rendering, although the usual threshold of .01 a step would delete a fog of alpha .997.
+/// Matrix: occupancy with a fog of sigma dt = 0.0099 in every cell. Neither training nor renders lose any of it,
+/// although the usual threshold of 0.01 per step would delete a fog of alpha 0.997.
 #[test]
-fn a_fog_just_below_the_usual_threshold_stays() {
+fn fog_just_below_the_usual_threshold_stays() {
     let step = 1.0 / 128.0;
     let sigma = 0.0099 / step as f32;
     let config = OccupancyConfig { resolution: 16, ..OccupancyConfig::default() };
@@ -156,7 +156,7 @@ fn a_fog_just_below_the_usual_threshold_stays() {
         grid.rebuild(skip.min_sigma(grid.longest_path()), false, &fog);
         assert_eq!(grid.occupied_share(), 1.0, "{skip}");
     }
-    // And where there is nothing, nothing stays.
+    // Without density no cell stays.
     let nothing = |points: &[[f32; 3]], out: &mut [f32]| out[..points.len()].fill(0.0);
     let mut grid = OccupancyGrid::new([DVec3::NEG_ONE, DVec3::ONE], &config).unwrap();
     grid.update(&Update::ALL, 0, 0, &nothing);
@@ -164,9 +164,9 @@ fn a_fog_just_below_the_usual_threshold_stays() {
     assert_eq!(grid.occupied_share(), 0.0);
 }
 
-/// Matrix: the most that may be skipped, along the longest ray, changes a colour by no more than the declared bound.
+/// Matrix: the most that may be skipped, along the longest ray, changes a colour by at most the declared bound.
 #[test]
-fn the_worst_fog_costs_no_more_than_declared() {
+fn skipped_fog_error_is_within_its_bound() {
     for skip in [Skip::NearLossless, Skip::Fast] {
         let config = OccupancyConfig { resolution: 16, ..OccupancyConfig::default() };
         let mut grid = OccupancyGrid::new([DVec3::NEG_ONE, DVec3::ONE], &config).unwrap();
@@ -178,15 +178,15 @@ fn the_worst_fog_costs_no_more_than_declared() {
         };
         assert_eq!(share(&mut grid, sigma.next_up()), 1.0);
         assert_eq!(share(&mut grid, sigma), 0.0);
-        // From corner to corner, alpha is what is lost of white fog over black.
+        // From corner to corner, alpha is the loss of white fog over black.
         let lost = -(-f64::from(sigma) * grid.longest_path()).exp_m1();
         assert!(lost <= skip.error_bound() * (1.0 + 1e-6) && lost > 0.9 * skip.error_bound(), "{skip}: {lost}");
     }
 }
 
-/// The same samples are taken of what is left, whatever else is skipped.
+/// The remaining samples do not depend on what is skipped.
 #[test]
-fn skipping_moves_no_sample() {
+fn skipping_keeps_sample_positions() {
     let config = OccupancyConfig { resolution: 16, ..OccupancyConfig::default() };
     let mut grid = OccupancyGrid::new([DVec3::NEG_ONE, DVec3::ONE], &config).unwrap();
     let rays = ray_along_z::<f32>(-3.0, [0.0, 10.0]);

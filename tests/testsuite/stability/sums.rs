@@ -1,4 +1,4 @@
-//! Long sums, and sums in which many threads or places take part.
+//! Long sums, and sums over many threads or into few positions.
 
 use super::support::*;
 use raygrad::{Axes, RowSums, Scalar, Segments, Tape, Tensor};
@@ -34,7 +34,7 @@ fn long_sums<T: Scalar>() {
     within("segment", one, expected, by_type::<T>(1e-6, 1e-15) * size);
 }
 
-/// A sum of rows at places in three ways: the operation, the gradient of gathering, and along an axis.
+/// A sum of rows by index in three ways: the operation, the gradient of gathering, and a sum along an axis.
 fn scattered<T: Scalar>(rows: &Tensor<T>, index: &Arc<[u32]>, places: usize) -> [Vec<f64>; 3] {
     let tape = Tape::new();
     let x = tape.leaf(rows.clone());
@@ -73,7 +73,7 @@ fn many_rows_to_few_places<T: Scalar>() {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
                 assert_eq!(pool.install(|| scattered(&rows, &index, places)), got, "{threads} threads");
             }
-            // Shuffled: other bits perhaps, the same sum.
+            // Shuffled: the same sum, perhaps with other bits.
             let order = |i: usize| (i * 7919) % n;
             let shuffled = Tensor::from_fn(&[n, 2], |k| rows.as_slice()[2 * order(k / 2) + k % 2]);
             let index: Arc<[u32]> = (0..n).map(|i| index[order(i)]).collect();
@@ -85,8 +85,8 @@ fn many_rows_to_few_places<T: Scalar>() {
     }
 }
 
-/// As many shares as a slot of a training step has samples, all for one row of a table: such sums are kept in the table's
-/// own precision.
+/// As many shares as a slot of a training step has samples, all for one row of a table. Such sums have the table's
+/// precision.
 fn shares_of_one_row_of_a_table<T: Scalar>() {
     let n = 2048;
     let mut random = noise(23);

@@ -1,11 +1,11 @@
-//! What the tests share: both precisions, comparisons that NaN fails, and the constants.
+//! Helpers of the tests: both precisions, comparisons that fail for NaN, and constants.
 
 use raygrad::nerf::volume::{OpticalDepth, accumulate, weights};
 use raygrad::nerf::{Ray, Rays, glam::DVec3};
 use raygrad::{Scalar, Segments, Tensor, Var};
 use serde_json::Value;
 
-/// Makes a test in each precision of functions that are generic over the number type.
+/// Makes tests in each precision from generic functions.
 macro_rules! both {
     ($($(#[$attribute:meta])* $name:ident),* $(,)?) => {
         mod single {
@@ -39,7 +39,7 @@ pub fn greatest<T: Scalar>() -> f64 {
     by_type::<T>(f32::MAX.into(), f64::MAX)
 }
 
-/// The number as the type holds it.
+/// The number rounded to the type.
 pub fn round<T: Scalar>(x: f64) -> f64 {
     T::from_f64(x).to_f64()
 }
@@ -54,12 +54,12 @@ pub fn tensor<T: Scalar>(shape: &[usize], values: &[f64]) -> Tensor<T> {
     Tensor::from_vec(shape, values.iter().map(|&x| T::from_f64(x)).collect())
 }
 
-/// Its elements.
+/// The elements of a tensor.
 pub fn numbers<T: Scalar>(x: &Tensor<T>) -> Vec<f64> {
     x.as_slice().iter().map(|x| x.to_f64()).collect()
 }
 
-/// `got` is `expected` to the relative `tolerance`, or to the smallest number that the type holds.
+/// Checks that `got` is `expected` up to the relative `tolerance`, or up to the type's smallest number.
 #[track_caller]
 pub fn near<T: Scalar>(what: &str, got: f64, expected: f64, tolerance: f64) {
     if got == expected {
@@ -69,25 +69,25 @@ pub fn near<T: Scalar>(what: &str, got: f64, expected: f64, tolerance: f64) {
     assert!(error <= tolerance * expected.abs() + smallest::<T>(), "{what} in {}: {got:e} for {expected:e}", T::NAME);
 }
 
-/// `got` is within `tolerance` of `expected`.
+/// Checks that `got` is within `tolerance` of `expected`.
 #[track_caller]
 pub fn within(what: &str, got: f64, expected: f64, tolerance: f64) {
     assert!((got - expected).abs() <= tolerance, "{what}: {got:e} for {expected:e}, tolerance {tolerance:e}");
 }
 
-/// How far a matrix, row by row, is from a rotation: the Frobenius norm of `R'R - 1`.
+/// The distance of a row-major matrix from a rotation: the Frobenius norm of `R'R - 1`.
 pub fn skewness(rotation: &[f64]) -> f64 {
     let gram = |i: usize, j: usize| (0..3).map(|k| rotation[3 * k + i] * rotation[3 * k + j]).sum::<f64>();
     (0..9).map(|k| (gram(k / 3, k % 3) - f64::from(u8::from(k % 4 == 0))).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Neither infinite nor NaN.
+/// Checks that no element is infinite or NaN.
 #[track_caller]
 pub fn finite<T: Scalar>(what: &str, x: &Tensor<T>) {
     assert!(x.is_finite(), "{what} in {}: {x:?}", T::NAME);
 }
 
-/// The distance to the next larger number of the type, at `x`.
+/// The distance from `x` to the type's next larger number.
 pub fn ulp<T: Scalar>(x: f64) -> f64 {
     if size_of::<T>() == 4 {
         let x = (x.abs() as f32).min(f32::MAX.next_down());
@@ -98,7 +98,7 @@ pub fn ulp<T: Scalar>(x: f64) -> f64 {
     }
 }
 
-/// The next number of the type, upwards or downwards.
+/// The type's next number, upwards or downwards.
 pub fn beside<T: Scalar>(x: f64, up: bool) -> f64 {
     match (size_of::<T>() == 4, up) {
         (true, true) => (x as f32).next_up().into(),
@@ -108,7 +108,7 @@ pub fn beside<T: Scalar>(x: f64, up: bool) -> f64 {
     }
 }
 
-/// The text of the error or panic that `f` ends in.
+/// The message of the error or panic that `f` ends in.
 #[track_caller]
 pub fn panic_of<R>(f: impl FnOnce() -> R) -> String {
     let Err(panic) = std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)) else { panic!("nothing panicked") };
@@ -125,7 +125,7 @@ pub fn ray_along_z<T: Scalar>(z: f64, span: [f64; 2]) -> Rays<T> {
     rays
 }
 
-/// A generator of numbers in 0..1 that needs no crate: the fractional parts of multiples of the golden ratio, scrambled.
+/// A generator of numbers in 0..1 without a dependency: scrambled fractional parts of multiples of the golden ratio.
 pub fn noise(seed: u64) -> impl FnMut() -> f64 {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x1234_5678_9abc_def1;
     move || {
@@ -136,7 +136,7 @@ pub fn noise(seed: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// Composited features and the light that is left, `[rays, channels + 1]`: the operations of volume rendering in a row.
+/// Composited features and the remaining light, `[rays, channels + 1]`, by the operations of volume rendering.
 pub fn composite<'t, T: Scalar>(
     depth: OpticalDepth<T>,
     segments: &Segments,
