@@ -1,4 +1,4 @@
-//! Scenes as captures, the built-in ones too.
+//! Captures of folders and of built-in scenes.
 
 use std::path::Path;
 
@@ -10,14 +10,16 @@ use super::output::make_folder;
 use super::progress::Progress;
 use super::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
 
-/// Width in pixels of cameras without pictures, before they are made as wide as is asked for.
+/// Width in pixels of the cameras of a built-in scene before they are scaled.
 const SMALL: usize = 8;
 
-/// What a folder's files say; or the cameras of a built-in scene whose pictures are `width` pixels wide, by default as wide as those
-/// that are trained on, with the pictures in `folder`, if one is given.
+/// Reads the capture of a folder, or builds that of a built-in scene. The images of a built-in scene are `width` pixels
+/// wide, by default as for training. They are written to `folder` if it is given.
 ///
 /// # Errors
-/// If the files cannot be read; if a built-in scene has no pictures of that width, or they cannot be written.
+///
+/// Fails if the files cannot be read. For a built-in scene, fails if the width is not supported or the images cannot be
+/// written.
 pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Result<Capture> {
     let (usual, format): ([usize; 2], _) = match scene {
         Scene::Embedded => ([EMBEDDED_SIZE; 2], Format::Blender),

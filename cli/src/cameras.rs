@@ -1,4 +1,4 @@
-//! Cameras for pictures: an orbit like the training cameras, and views at other sizes.
+//! Cameras of renders: orbits like the training cameras, and views at other image sizes.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -7,7 +7,7 @@ use raygrad::nerf::dataset::Dataset;
 use raygrad::nerf::{Camera, Error, Result, SceneBox};
 use serde::{Deserialize, Serialize};
 
-/// The average training camera: what is needed to fly around a scene without its photographs.
+/// The average training camera, which allows orbits without the images.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Viewpoint {
@@ -35,20 +35,20 @@ fn all_around() -> f64 {
     PI
 }
 
-/// Cameras leave at most this angle of a circle free, in radians, that stand all around.
+/// Largest gap in radians between the directions of cameras that surround the scene.
 const GAP: f64 = 2.0 * PI / 3.0;
 
-/// At an elevation closer to the poles than this, in radians, there is no telling where up is.
+/// Within this angle of a pole, in radians, the up direction is ambiguous.
 const FROM_POLE: f64 = 0.1;
 
-/// Cameras that are nearer to the centre, as a share of the box's side, look outwards.
+/// Cameras within this distance of the centre, as a fraction of the box's side, look outwards.
 const FROM_CENTRE: f64 = 0.02;
 
-/// Most pixels on a side of a training image: more would only come from a damaged file.
+/// Largest side of a training image in pixels. Larger values come from damaged files.
 const LARGEST: usize = 1 << 16;
 
 impl Viewpoint {
-    /// The average of a dataset's cameras; it has at least one.
+    /// The average of a dataset's cameras. The dataset is not empty.
     pub fn of(data: &Dataset) -> Self {
         let camera = &data.frames[0].camera;
         let count = data.frames.len() as f64;
@@ -67,7 +67,7 @@ impl Viewpoint {
         }
     }
 
-    /// Whether the numbers are usable.
+    /// Fails if a number is out of range.
     pub fn check(&self) -> Result<()> {
         let positive = |x: f64| x > 0.0 && x.is_finite();
         let checks = [
@@ -90,9 +90,9 @@ impl Viewpoint {
         }
     }
 
-    /// `count` cameras on a circle around the centre of the box, all looking at it, with z upwards; where the photographs
-    /// are from a part of the circle, they swing to and fro on that. Those of a panorama, which was taken from the centre, stand
-    /// there and look around.
+    /// Returns `count` cameras on a circle around the centre of the box. All of them look at it, with z upwards. If the
+    /// images cover a part of the circle, the cameras swing to and fro on that part. The cameras of a panorama stand at
+    /// the centre and look around.
     pub fn orbit(&self, extent: &SceneBox, count: usize) -> Vec<Camera> {
         let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
         let camera = |i: usize| {
@@ -110,7 +110,7 @@ impl Viewpoint {
     }
 }
 
-/// The middle and half the width of the part of a circle that angles are in: half a turn if there is no large gap.
+/// Middle and half width of the arc of these angles; half a turn if there is no large gap.
 fn arc(mut angles: Vec<f64>) -> (f64, f64) {
     angles.sort_by(f64::total_cmp);
     let next = angles.iter().skip(1).copied().chain(angles.first().map(|first| first + TAU));
@@ -121,8 +121,8 @@ fn arc(mut angles: Vec<f64>) -> (f64, f64) {
     }
 }
 
-/// The view of a camera at another image size: all that it sees stays in the picture, pixels keep their shape, and a
-/// side that is longer in proportion shows more.
+/// Fits a camera to another image size. The whole original view remains visible and pixels keep their shape. A
+/// relatively longer side shows more.
 pub fn fitted(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
     let old = [camera.width as f64, camera.height as f64];
     let new = [width as f64, height as f64];
@@ -134,7 +134,7 @@ pub fn fitted(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
 #[cfg(test)]
 mod tests {
     #[test]
-    fn a_panorama_is_looked_around_in() {
+    fn orbit_of_panorama_looks_outwards() {
         let viewpoint =
             Viewpoint { width: 40, height: 30, angle_x: 1.0, distance: 0.0, elevation: 0.0, azimuth: 0.3, reach: 0.2 };
         viewpoint.check().unwrap();
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn an_orbit_keeps_distance_elevation_and_angle() {
+    fn orbit_keeps_distance_elevation_and_angle() {
         let (view, extent) = viewpoint();
         let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
         for camera in view.orbit(&extent, 7) {
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn one_sided_images_are_known_by_direction() {
+    fn viewpoint_one_sided_has_azimuth_and_reach() {
         let mut data = embedded(Split::Train, 8);
         let centre = 0.5 * (data.bounds[0] + data.bounds[1]);
         // Within 40 degrees of the y axis.
@@ -185,10 +185,10 @@ mod tests {
     }
 
     #[test]
-    fn an_orbit_swings_where_photographs_are_from() {
+    fn orbit_one_sided_swings_on_the_arc() {
         assert_eq!(viewpoint().0.reach, PI, "they are from all around");
         assert_eq!(arc((0..4).map(|i| f64::from(i) * FRAC_PI_2).collect()), (0.0, PI));
-        // Across the place where angles begin again.
+        // An arc across the discontinuity of the angle.
         let (middle, half) = arc(vec![3.0, -3.0, 2.5, -2.8]);
         let ends = [2.5, TAU - 2.8];
         assert!((half - 0.5 * (ends[1] - ends[0])).abs() < 1e-12, "{half}");
@@ -214,12 +214,12 @@ mod tests {
     }
 
     #[test]
-    fn a_fitted_view_keeps_what_was_seen() {
+    fn fitted_view_keeps_the_original_rays() {
         let (view, extent) = viewpoint();
         let camera = &view.orbit(&extent, 1)[0];
         assert_eq!(fitted(camera, [8, 8]), *camera);
         let wide = fitted(camera, [32, 16]);
-        // The square in the middle of the wide picture is the old picture.
+        // The central square of the wide image is the original image.
         for (x, y) in [(0.0, 0.0), (8.0, 0.0), (3.0, 5.0)] {
             let (old, new) = (camera.ray(x, y), wide.ray(8.0 + 2.0 * x, 2.0 * y));
             assert!(old.direction.distance(new.direction) < 1e-12);
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_named() {
+    fn viewpoint_out_of_range_is_refused() {
         let (view, _) = viewpoint();
         let message = Viewpoint { distance: -1.0, ..view }.check().unwrap_err().to_string();
         assert_eq!(message, "`viewpoint.distance`: is -1; use 0 or more");

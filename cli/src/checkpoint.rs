@@ -1,6 +1,7 @@
-//! What a run goes on from: `checkpoints/STEP.checkpoint`, the last two of them, or as many as are to stay.
+//! Checkpoints of a run: `checkpoints/STEP.checkpoint`. By default the last two are kept.
 //!
-//! A line of text, `raygrad checkpoint VERSION CRC32 LENGTH`, and a [state](Trainer::state) of that length.
+//! A file holds a line of text, `raygrad checkpoint VERSION CRC32 LENGTH`, and a [state](Trainer::state) of that
+//! length.
 
 use std::fs;
 use std::io::{ErrorKind, Read};
@@ -11,51 +12,52 @@ use raygrad::nerf::{Error, Result, Trainer, write_atomic};
 use super::output::{complain, make_folder, remove};
 use super::run::Run;
 
-/// How files are laid out; newer ones are refused.
+/// Version of the file format. Later versions are refused.
 const VERSION: u32 = 1;
 /// The first words of a file.
 const MAGIC: &str = "raygrad checkpoint";
-/// Longest first line that is looked for, in bytes.
+/// Largest length of the first line, in bytes.
 const LONGEST: usize = 80;
 
 fn folder(run: &Run) -> PathBuf {
     run.file("checkpoints")
 }
 
-/// Writes where training is, and removes all others but the last, as many as the run keeps with this.
+/// Saves the state of a trainer. Keeps the last `keep_checkpoints` checkpoints and removes all others.
 pub fn save(run: &Run, trainer: &Trainer) -> Result<()> {
     let folder = folder(run);
     make_folder(&folder)?;
     let step = trainer.stats().step;
     write_atomic(folder.join(format!("{step:08}.checkpoint")), &framed(&trainer.state()?))?;
-    // What is said to be later was damaged, and passed over.
+    // Checkpoints of later steps are damaged, since loading skipped them.
     let (mut surplus, others): (Vec<_>, Vec<_>) = all(&folder)?.into_iter().partition(|(own, _)| *own > step);
     surplus.extend(others.into_iter().skip(run.config.keep_checkpoints));
     remove(&surplus.into_iter().map(|(_, path)| path).collect::<Vec<_>>());
     Ok(())
 }
 
-/// The bytes of a file that holds a state.
+/// The bytes of a checkpoint with this state.
 pub(super) fn framed(state: &[u8]) -> Vec<u8> {
     let mut bytes = format!("{MAGIC} {VERSION} {:08x} {}\n", crc32fast::hash(state), state.len()).into_bytes();
     bytes.extend(state);
     bytes
 }
 
-/// Whether a run has a checkpoint, whole or not.
+/// Returns true if a run has a checkpoint, intact or damaged.
 pub fn exists(run: &Run) -> Result<bool> {
     Ok(!all(&folder(run))?.is_empty())
 }
 
-/// The steps of which a run has checkpoints, whole or not, the first one first.
+/// The steps of a run's checkpoints, intact or damaged, in ascending order.
 pub fn steps(run: &Run) -> Result<Vec<u64>> {
     Ok(all(&folder(run))?.into_iter().rev().map(|(step, _)| step).collect())
 }
 
-/// The state of a run at a step.
+/// Reads the state of a run at a step.
 ///
 /// # Errors
-/// If there is no checkpoint of this step, or it is damaged.
+///
+/// Fails if there is no checkpoint of this step or it is damaged.
 pub fn read(run: &Run, step: u64) -> Result<Vec<u8>> {
     let found = all(&folder(run))?.into_iter().find(|(own, _)| *own == step);
     let (_, path) = found.ok_or_else(|| Error::file(folder(run), format!("no checkpoint of step {step}")))?;
@@ -63,7 +65,7 @@ pub fn read(run: &Run, step: u64) -> Result<Vec<u8>> {
     parse(&path, bytes)
 }
 
-/// The checkpoints in a folder with their steps, the latest first.
+/// The steps and paths of the checkpoints in a folder, latest first.
 fn all(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let entries = match fs::read_dir(folder) {
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
@@ -79,13 +81,13 @@ fn all(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     Ok(found)
 }
 
-/// Removes the latest checkpoint if it is of this step and there is one before it.
+/// Removes the latest checkpoint if it is of this step and an earlier one exists.
 pub fn step_back(run: &Run, step: Option<u64>) -> Result<()> {
     remove(surplus(&all(&folder(run))?, step).as_slice());
     Ok(())
 }
 
-/// The first of these, the latest, if it is of this step and there is another.
+/// The first path, the latest, if it is of this step and another one exists.
 fn surplus(found: &[(u64, PathBuf)], step: Option<u64>) -> Option<PathBuf> {
     match found {
         [(latest, path), _, ..] if Some(*latest) == step => Some(path.clone()),
@@ -93,22 +95,22 @@ fn surplus(found: &[(u64, PathBuf)], step: Option<u64>) -> Option<PathBuf> {
     }
 }
 
-/// Takes a trainer to the latest checkpoint that is whole; one that is not is said to be so. If none is whole, that is an error,
-/// and if there is none although steps were taken; without steps, the trainer stays at its beginning.
+/// Loads the latest intact checkpoint into a trainer and warns of damaged ones. Fails if all are damaged, or if none
+/// exists although the run has taken steps. A trainer of a run without steps keeps its initial state.
 pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     let checkpoints = all(&folder(run))?;
     let none = checkpoints.is_empty();
-    // What a later raygrad wrote is not passed over, and lost.
+    // A checkpoint of a later version is an error: skipping it would lose progress.
     for (_, path) in &checkpoints {
         let mut beginning = vec![];
-        // What cannot be read is said below.
+        // Errors of reading are handled below.
         let read = fs::File::open(path).and_then(|file| file.take(LONGEST as u64).read_to_end(&mut beginning));
         if read.is_ok() {
             check_version(path, &beginning)?;
         }
     }
     for (_, path) in checkpoints {
-        // One that is there and cannot be read just now is not passed over either.
+        // A checkpoint that cannot be read is an error too, since the cause may be temporary.
         let unread =
             |e| Error::file(&path, format!("cannot be read: {e}; delete it to resume from the checkpoint before it"));
         let bytes = fs::read(&path).map_err(unread)?;
@@ -121,7 +123,7 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
         false => {
             Err(Error::file(folder(run), "every checkpoint is damaged, so the run cannot resume: train a new run"))
         }
-        // The first one is there before the metrics are.
+        // Training writes the first checkpoint before the metrics.
         true if run.file("metrics.jsonl").exists() => Err(Error::file(
             &run.folder,
             "has no checkpoints, like runs of earlier versions, and cannot resume: train a new run",
@@ -130,7 +132,7 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     }
 }
 
-/// Whether a file that begins so is not of a later version.
+/// Fails if the file's beginning names a later version.
 fn check_version(path: &Path, beginning: &[u8]) -> Result<()> {
     let version = || -> Option<u32> {
         let line = beginning.iter().take(LONGEST).position(|byte| *byte == b'\n')?;
@@ -149,7 +151,7 @@ fn check_version(path: &Path, beginning: &[u8]) -> Result<()> {
     }
 }
 
-/// The state in the bytes of a file.
+/// Extracts the state from the bytes of a file.
 pub(super) fn parse(path: &Path, mut bytes: Vec<u8>) -> Result<Vec<u8>> {
     let bad = |what: String| Error::file(path, what);
     check_version(path, &bytes)?;
@@ -180,7 +182,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn damaged_checkpoint_is_refused() {
+    fn parse_damaged_checkpoint_fails() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("00000007.checkpoint");
         let state: Vec<u8> = (0..200_u8).collect();
@@ -194,7 +196,7 @@ mod tests {
         let mut changed = whole.clone();
         for bit in 0..8 * whole.len() {
             changed[bit / 8] ^= 1 << (bit % 8);
-            // Only how the checksum is written may differ: in capitals.
+            // The letter case of the checksum is the only change that is accepted.
             assert!(read(&changed).is_err() || read(&changed).unwrap() == state, "bit {bit}");
             changed[bit / 8] ^= 1 << (bit % 8);
         }
@@ -206,7 +208,7 @@ mod tests {
         );
         let newer = [b"raygrad checkpoint 2 00000000 200\n".as_slice(), &state].concat();
         assert!(read(&newer).unwrap_err().to_string().contains("version 2"));
-        // The latest comes first, by number and not by name; others are none.
+        // Sorted by number, not by name. Other files are ignored.
         for name in ["00000007.checkpoint", "00000100.checkpoint", "20.checkpoint", "x.checkpoint", "00000200.tmp"] {
             fs::write(folder.path().join(name), b"").unwrap();
         }

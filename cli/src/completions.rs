@@ -1,4 +1,4 @@
-//! `raygrad completions`: scripts by which shells complete commands and flags.
+//! `raygrad completions`: completion scripts for shells.
 
 use clap::CommandFactory;
 use clap_complete::Shell;
@@ -37,7 +37,7 @@ mod tests {
     use clap::ValueEnum;
 
     #[test]
-    fn completions_name_each_command_and_flag() {
+    fn completions_contain_all_commands_and_flags() {
         for shell in Shell::value_variants() {
             let script = script(*shell).unwrap();
             for command in commands() {

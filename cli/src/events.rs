@@ -1,7 +1,7 @@
-//! Event files, which TensorBoard reads: `raygrad train --tensorboard`.
+//! TensorBoard event files: `raygrad train --tensorboard`.
 //!
-//! A file is a row of records, each of them a length, its checksum, that many bytes and their checksum (TensorFlow's TFRecord). The
-//! bytes are a message `Event` of `event.proto`, as protocol buffers encode it.
+//! A file is a sequence of TensorFlow's TFRecords: length, checksum of the length, data, checksum of the data. The data
+//! is an `Event` of `event.proto` in protocol buffer encoding.
 
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -12,35 +12,36 @@ use raygrad::nerf::Result;
 use super::journal::Journal;
 use super::output::make_folder;
 
-/// How the names of files begin; then come the seconds since 1970.
+/// Prefix of file names. The seconds since 1970 follow.
 const PREFIX: &str = "events.out.tfevents.";
 /// CRC-32C.
 const CHECKSUM: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 /// `SessionLog.SessionStatus.START`.
 const START: i64 = 1;
-/// What `Summary.Image.colorspace` calls red, green and blue.
+/// `Summary.Image.colorspace` of RGB images.
 const RGB: i64 = 3;
 
-/// The event file of one part of a run.
+/// The event file of one session of a run.
 pub struct Events(Journal);
 
 impl Events {
-    /// A new file in a folder, which is made, for steps from this one on. TensorBoard hides what earlier files say of them.
+    /// Creates the folder and a new file in it for the steps from this one on. TensorBoard hides these steps of earlier
+    /// files.
     pub fn create(folder: &Path, step: u64) -> Result<Self> {
         make_folder(folder)?;
         let time = now();
-        // Files are read in the order of their names: this one is after all others, whatever the clock says.
+        // TensorBoard reads files in order of their names. This name is the last one, even if the clock went back.
         let after = latest(folder).map_or(0, |latest| latest.saturating_add(1));
         let path = folder.join(format!("{PREFIX}{:010}.raygrad", after.max(time as u64)));
         Journal::begin(&path, &[record(&version(time)), record(&start(time, step))].concat()).map(Events)
     }
 
-    /// Numbers of a step by their names; those before a `/` are shown together.
+    /// Adds named scalars of a step. TensorBoard groups names by the part before `/`.
     pub fn scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
         self.0.add(&record(&scalars(now(), step, values)))
     }
 
-    /// A PNG file of that width and height.
+    /// Adds a PNG file of this width and height.
     pub fn image(&mut self, step: u64, name: &str, size: [usize; 2], png: &[u8]) -> Result<()> {
         self.0.add(&record(&image(now(), step, name, size, png)))
     }
@@ -51,20 +52,20 @@ fn now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64()
 }
 
-/// The seconds in the name of the last file in a folder.
+/// The seconds in the name of the last event file of a folder.
 fn latest(folder: &Path) -> Option<u64> {
     let names = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.file_name());
     let seconds = |name: &str| name.strip_prefix(PREFIX)?.split('.').next()?.parse().ok();
     names.filter_map(|name| seconds(name.to_str()?)).max()
 }
 
-/// The first event of a file: how it is laid out, and by whom.
+/// The first event of a file: the format version and the writer.
 fn version(time: f64) -> Vec<u8> {
     let writer = Message::default().bytes(1, b"raygrad");
     Message::default().double(1, time).bytes(3, b"brain.Event:2").bytes(10, &writer.0).0
 }
 
-/// Training begins, or begins again, at this step.
+/// Marks the start of a session at this step.
 fn start(time: f64, step: u64) -> Vec<u8> {
     event(time, step).bytes(7, &Message::default().integer(1, START).0).0
 }
@@ -85,8 +86,8 @@ fn event(time: f64, step: u64) -> Message {
     Message::default().double(1, time).integer(2, step as i64)
 }
 
-/// A message of protocol buffers, field by field in the order of their numbers. Numbers that are 0 are left out, as their encoders do,
-/// but for one of several kinds of value, which [`float`](Self::float) is.
+/// A protocol buffer message with fields in the order of their numbers. As in other encoders, fields that are 0 are
+/// omitted. [`float`](Self::float) is a `oneof` value, which is always written.
 #[derive(Default)]
 struct Message(Vec<u8>);
 
@@ -142,7 +143,7 @@ fn record(bytes: &[u8]) -> Vec<u8> {
     record
 }
 
-/// A checksum that may itself be part of what has one.
+/// The masked CRC of TFRecord, for data that itself contains CRCs.
 fn masked(bytes: &[u8]) -> u32 {
     CHECKSUM.checksum(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
 }
@@ -155,7 +156,7 @@ mod tests {
     const REFERENCE: &[u8] = include_bytes!("../tests/reference/events.bin");
 
     #[test]
-    fn files_are_those_of_tensorboard_byte_for_byte() {
+    fn events_equal_the_tensorboard_reference() {
         let named = |values: &[(&str, f64)]| -> Vec<(String, f64)> {
             values.iter().map(|(name, value)| ((*name).to_owned(), *value)).collect()
         };
@@ -176,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_written_in_groups_of_seven_bits() {
+    fn varint_groups_have_seven_bits() {
         let full = [[0xff; 9].as_slice(), &[1]].concat();
         let cases: [(u64, &[u8]); 7] = [
             (0, &[0]),
@@ -195,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn later_event_file_has_a_later_name() {
+    fn create_again_gives_a_later_name() {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path().join("made");
         for number in 0..2 {
@@ -216,7 +217,7 @@ mod tests {
         let length = || std::fs::metadata(&path).unwrap().len();
         let begun = length();
         events.scalars(8, &[("x".to_owned(), 1.0)]).unwrap();
-        // Its length, the sum of that, time, step, summary of 10 bytes, and the sum of these.
+        // Length, its checksum, time, step, summary of 10 bytes, and the checksum of the data.
         assert_eq!(length() - begun, 8 + 4 + 9 + 2 + 12 + 4);
     }
 }

@@ -1,4 +1,4 @@
-//! What the command line reads, on damaged input: an error, and never a panic.
+//! Property tests of inputs of the command line: damaged input gives an error, never a panic.
 
 use std::path::Path;
 
@@ -53,7 +53,7 @@ fn names(value: &Value, name: &str, out: &mut Vec<String>) {
     out.push(name.to_owned());
 }
 
-/// Values as somebody may type them.
+/// Values as a user may type them.
 fn typed() -> impl Strategy<Value = String> {
     let numbers = any::<f64>().prop_map(|x| x.to_string());
     let words =
@@ -65,7 +65,7 @@ proptest! {
     #![proptest_config(cases())]
 
     #[test]
-    fn settings(text in "\\PC{0,20}", which in any::<prop::sample::Index>(), typed in typed()) {
+    fn setting_fuzzed_is_clear(text in "\\PC{0,20}", which in any::<prop::sample::Index>(), typed in typed()) {
         let config = run_config().config;
         let mut all = vec![];
         names(&serde_json::to_value(&config).unwrap(), "", &mut all);
@@ -73,14 +73,14 @@ proptest! {
             let Ok((name, value)) = parse::setting(&text) else { continue };
             match changed(&config, &name, &value).and_then(|config| config.check()) {
                 Ok(()) => {}
-                // What is out of range is named by its last part.
+                // Errors name the last part of the setting.
                 Err(error) => clear(error, "`"),
             }
         }
     }
 
     #[test]
-    fn durations_and_sizes(text in "\\PC{0,12}", number in any::<f64>(), unit in "[smhx]?", [a, b] in any::<[u64; 2]>()) {
+    fn duration_and_size_fuzzed(text in "\\PC{0,12}", number in any::<f64>(), unit in "[smhx]?", [a, b] in any::<[u64; 2]>()) {
         for text in [text, format!("{number}{unit}"), format!("{number:e}{unit}")] {
             if let Ok(duration) = parse::duration(&text) {
                 prop_assert!(!duration.is_zero());
@@ -95,7 +95,7 @@ proptest! {
 }
 
 #[test]
-fn campaign_configurations_of_runs() {
+fn campaign_run_configs() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("config.json");
     let config = |preset, scene| {
@@ -109,19 +109,19 @@ fn campaign_configurations_of_runs() {
     let parse = |bytes: &[u8]| {
         std::fs::write(&file, bytes).unwrap();
         let run = Run::open(folder.path())?;
-        // The path of the camera, for whatever has passed the checks.
+        // Checked configurations give valid orbits.
         for camera in run.config.viewpoint.orbit(&run.config.scene_box, 3) {
             assert!(camera.width > 0 && camera.width <= 1 << 16 && camera.focal[0] > 0.0, "{camera:?}");
         }
         Ok::<(), Error>(())
     };
-    // A name of a photograph takes two bytes and a comma of a document, and 24 of memory.
+    // An image name takes three bytes of the document and 24 bytes of memory.
     let bound = Bound { times: 256, plus: 1 << 18 };
     campaign("run's config.json", &whole, bound, parse, |error| clear(error, "config.json"));
 }
 
 #[test]
-fn campaign_messages_of_pages() {
+fn campaign_viewer_messages() {
     let pose = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 1.0]];
     let free = json!({ "ask": "view", "id": 7, "view": { "eye": { "free": { "pose": pose, "fov": 40.5 } },
         "size": [640, 480], "show": "normals", "background": [255, 0, 7], "crop": [[-1, -1, -1], [1, 1, 1]], "skip": "off", "checkpoint": 12 } });
@@ -136,7 +136,7 @@ fn campaign_messages_of_pages() {
     let whole: Vec<Vec<u8>> =
         [free, kept].iter().chain(&others).map(|message| message.to_string().into_bytes()).collect();
     let parse = |bytes: &[u8]| {
-        // What is no text is closed before.
+        // The server closes the connection for messages that are not text.
         let ask = ClientMessage::read(std::str::from_utf8(bytes).map_err(|e| e.to_string())?)?;
         if let ClientMessage::View { view, .. } | ClientMessage::Save { view } = &ask {
             let [width, height] = view.size.map(|side| side as usize);

@@ -1,6 +1,6 @@
-//! Pages that ask nothing of the network.
+//! Templates of self-contained pages.
 
-/// A page with these texts in their places, each `{{name}}`; what a text holds is no place.
+/// Replaces each `{{name}}` of a page by its text. Placeholders in the texts are not replaced.
 pub fn filled(page: &str, texts: &[(&str, String)]) -> String {
     let mut parts = page.split("{{");
     let mut page = parts.next().unwrap_or_default().to_owned();
@@ -13,7 +13,7 @@ pub fn filled(page: &str, texts: &[(&str, String)]) -> String {
     page
 }
 
-/// A text in which nothing is taken for markup.
+/// Escapes HTML markup in a text.
 pub fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
@@ -23,7 +23,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_text_holds_is_neither_a_place_nor_markup() {
+    fn filled_text_is_not_expanded_or_markup() {
         let page = filled("a {{x}} b {{y}} {{x}}{{z}}.", &[("x", "{{y}}".to_owned()), ("y", "2".to_owned())]);
         assert_eq!(page, "a {{y}} b 2 {{y}}.");
         assert_eq!(escaped("<a & \"b\">"), "&lt;a &amp; &quot;b&quot;&gt;");

@@ -1,4 +1,4 @@
-//! Ctrl-C: the first asks to stop, the second stops. SIGTERM and a hang-up ask, however often they come.
+//! Signals. The first Ctrl-C requests a stop, the second ends the program. SIGTERM and SIGHUP only request a stop.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -6,19 +6,19 @@ use raygrad::nerf::Error;
 
 use super::output::{complain, note};
 
-/// Exit code of a program that was interrupted: 128 + SIGINT, as a shell reports it.
+/// Exit code of an interrupted program: 128 + SIGINT, as shells report it.
 pub const EXIT_CODE: u8 = 130;
 
-/// Why work ended early.
+/// Reason for an early end of work.
 #[derive(Debug)]
 pub enum Stop {
-    /// There was a Ctrl-C.
+    /// Ctrl-C was pressed.
     Interrupted,
-    /// Something is wrong.
+    /// An error occurred.
     Failed(Error),
 }
 
-/// What comes of work that may be interrupted.
+/// Result of interruptible work.
 pub type Work<T> = Result<T, Stop>;
 
 impl From<Error> for Stop {
@@ -29,22 +29,22 @@ impl From<Error> for Stop {
 
 static REQUESTED: AtomicBool = AtomicBool::new(false);
 
-/// From now on a first Ctrl-C only sets [`requested`]; a second one ends the program at once.
+/// The first Ctrl-C sets [`requested`], a second one ends the program at once.
 pub fn listen() {
     set("stopping after this step; Ctrl-C again stops at once", "save the model");
 }
 
-/// As [`listen`], for frames that the same command goes on with.
+/// Like [`listen`], for frames that the same command can resume.
 pub fn listen_to_go_on() {
     set("stopping after this frame; Ctrl-C again stops at once", "finish this frame");
 }
 
-/// As [`listen`], for work whose unfinished result is removed.
+/// Like [`listen`], for work whose unfinished result is removed.
 pub fn listen_to_remove() {
     set("stopping and removing unfinished files; Ctrl-C again stops at once", "remove unfinished files");
 }
 
-/// From now on the end of standard input counts as a Ctrl-C: of the program at its other end, whatever ends that.
+/// The end of standard input counts as a Ctrl-C. It shows that the parent program has ended.
 pub fn listen_to_input() {
     std::thread::spawn(|| {
         let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
@@ -55,7 +55,7 @@ pub fn listen_to_input() {
 fn set(said: &'static str, promise: &str) {
     let handler = move |is_ctrl_c: bool| match REQUESTED.swap(true, Ordering::Relaxed) {
         false => note(said),
-        // A terminal that is closed may hang up more than once: nobody asks for haste.
+        // A closed terminal may send SIGHUP more than once, so that only Ctrl-C ends the program.
         true if is_ctrl_c => std::process::exit(EXIT_CODE.into()),
         true => {}
     };
@@ -64,7 +64,7 @@ fn set(said: &'static str, promise: &str) {
     }
 }
 
-/// Whether it is to stop.
+/// Returns true if a stop was requested.
 pub fn requested() -> bool {
     REQUESTED.load(Ordering::Relaxed)
 }
@@ -78,8 +78,8 @@ mod system {
     use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
     use signal_hook::iterator::Signals;
 
-    /// Calls `handler` for each signal that asks this program to end, and says whether it is Ctrl-C. Those that it was started
-    /// to ignore, as by `nohup` or in the background of a script, stay ignored, here and in the programs that it starts.
+    /// Calls `handler` for each signal that ends programs. Its argument is true for Ctrl-C. Signals that are ignored at
+    /// start (`nohup`, background jobs of scripts) stay ignored, also in child processes.
     pub fn listen(handler: impl Fn(bool) + Send + 'static) -> io::Result<()> {
         let wanted = [SIGINT, SIGTERM, SIGHUP].into_iter().filter(|signal| !is_ignored(*signal));
         let mut signals = Signals::new(wanted)?;
@@ -87,11 +87,11 @@ mod system {
         std::thread::Builder::new().name("signals".into()).spawn(listener).map(drop)
     }
 
-    /// Whether a signal is ignored.
+    /// Returns true if a signal is ignored.
     fn is_ignored(signal: i32) -> bool {
         let mut action = MaybeUninit::<libc::sigaction>::zeroed();
-        // SAFETY: without a new action the call changes nothing; it writes a whole one to the place that is given, and that of
-        // zeros which is read otherwise is one too. Run by `ignored_signals_are_known`.
+        // SAFETY: a null action makes the call a query. It writes a whole `sigaction` to `action` if it succeeds. The
+        // initial zeros are a valid `sigaction` too. Run by `is_ignored_matches_known_signals`.
         let action = unsafe {
             libc::sigaction(signal, ptr::null(), action.as_mut_ptr());
             action.assume_init()
@@ -104,8 +104,8 @@ mod system {
         use super::*;
 
         #[test]
-        fn ignored_signals_are_known() {
-            // Rust's runtime ignores SIGPIPE; nobody ignores SIGCHLD here, and there is no signal 0.
+        fn is_ignored_matches_known_signals() {
+            // Rust's runtime ignores SIGPIPE. Nothing ignores SIGCHLD here, and signal 0 does not exist.
             assert!(is_ignored(libc::SIGPIPE));
             assert!(!is_ignored(libc::SIGCHLD) && !is_ignored(0));
         }

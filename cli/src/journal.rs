@@ -1,4 +1,4 @@
-//! Files that grow record by record.
+//! Append-only files of records.
 
 use std::fs::File;
 use std::io::Write;
@@ -6,29 +6,30 @@ use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Result, write_atomic};
 
-/// A file that holds whole records at any time. One that cannot be written, as the disk is full, waits for the next.
+/// A file that always holds whole records. A record that cannot be written, as on a full disk, is written with the next
+/// one.
 pub struct Journal {
     path: PathBuf,
     file: File,
-    /// The bytes of all whole records in the file.
+    /// Length of all whole records in the file, in bytes.
     length: u64,
     /// Records that are not in the file yet.
     waiting: Vec<u8>,
 }
 
 impl Journal {
-    /// Replaces a file by one with this beginning.
+    /// Replaces a file by a new one with this content.
     pub fn begin(path: &Path, beginning: &[u8]) -> Result<Self> {
         write_atomic(path, beginning)?;
         let file = File::options().append(true).open(path).map_err(|e| failed(path, &e))?;
         Ok(Journal { path: path.into(), file, length: beginning.len() as u64, waiting: vec![] })
     }
 
-    /// Adds a record, after those that wait.
+    /// Appends the waiting records and this one.
     pub fn add(&mut self, record: &[u8]) -> Result<()> {
         self.waiting.extend_from_slice(record);
         if let Err(error) = self.file.write_all(&self.waiting) {
-            // If that fails too, nobody can do more.
+            // No further recovery is possible.
             let _ = self.file.set_len(self.length);
             return Err(failed(&self.path, &error));
         }
@@ -47,12 +48,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_cannot_be_written_waits_for_what_can() {
+    fn add_after_failure_writes_waiting_records() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("records");
         let mut journal = Journal::begin(&path, b"begin\n").unwrap();
         journal.add(b"one\n").unwrap();
-        // A file that may only be read refuses all.
+        // A read-only file refuses every record.
         let writable = std::mem::replace(&mut journal.file, File::open(&path).unwrap());
         for record in [b"two\n", b"six\n"] {
             let message = journal.add(record).unwrap_err().to_string();

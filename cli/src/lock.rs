@@ -1,4 +1,4 @@
-//! Locks by which a program keeps others out of a folder.
+//! Locks of folders.
 
 use std::fs::{File, TryLockError};
 use std::io::ErrorKind;
@@ -8,26 +8,26 @@ use raygrad::nerf::{Error, Result, write_atomic};
 
 use super::output::{complain, remove};
 
-/// A folder that this program alone writes to, until this is dropped or the program ends, however it does.
+/// Exclusive access to a folder, until this is dropped or the program ends.
 ///
-/// The lock is on a file, and the folder can be moved and made anew with another one. So a second file beside it, which nobody
-/// locks, names the owner, and each write to the folder asks for the [`state`](Self::state) before.
+/// The lock is on a file. If the folder is moved and another one is created at its path, the lock moves with it. So a
+/// second, unlocked file beside it names the owner. Each write to the folder checks the [`state`](Self::state) first.
 #[derive(Debug)]
 pub struct Lock {
     path: PathBuf,
-    /// The process and a random number.
+    /// The process ID and a random number.
     owner: String,
     _file: File,
 }
 
-/// What has become of a lock.
+/// State of a lock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum State {
-    /// The folder is still this program's.
+    /// The program still owns the folder.
     Kept,
-    /// Nothing says whose it is: the folder was removed or moved.
+    /// The owner file is absent: the folder was removed or moved.
     Gone,
-    /// Another program has the folder, or one at the same path.
+    /// Another program owns the folder, or a new one at the same path.
     Lost,
 }
 
@@ -39,9 +39,10 @@ pub fn owner_of(path: &Path) -> PathBuf {
 }
 
 impl Lock {
-    /// Locks a file, which is made; `busy` says what to do if another program has it.
+    /// Creates and locks a file. `busy` gives the error if another program has locked it.
     ///
-    /// Where the file system has no locks, that is said, and an earlier owner finds its lock [lost](State::Lost).
+    /// If the file system does not support locks, prints a warning, and an earlier owner finds its lock
+    /// [lost](State::Lost).
     pub fn take(path: &Path, busy: impl Fn() -> Error) -> Result<Self> {
         Self::take_by(path, busy, File::try_lock)
     }
@@ -64,31 +65,32 @@ impl Lock {
         let owner = format!("{} {:016x}\n", std::process::id(), rand::random::<u64>());
         write_atomic(owner_of(path), owner.as_bytes())?;
         let lock = Lock { path: path.into(), owner, _file: file };
-        // The last owner may have removed the file while it was being opened here, and another program made it anew.
+        // The last owner may have removed the file after this program opened it, and another program may have created
+        // it again.
         match lock.state() {
             State::Kept if path.exists() => Ok(lock),
             _ => Err(busy()),
         }
     }
 
-    /// Whether another program has the lock on a file.
+    /// Returns true if another program has locked the file.
     pub fn is_taken(path: &Path) -> bool {
         File::open(path).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
     }
 
-    /// What has become of it.
+    /// The state of the lock.
     pub fn state(&self) -> State {
         match std::fs::read(owner_of(&self.path)) {
             Ok(owner) if owner == self.owner.as_bytes() => State::Kept,
             Ok(_) => State::Lost,
-            // NotADirectory: a file has taken the folder's place.
+            // NotADirectory: a file has replaced the folder.
             Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => State::Gone,
-            // A disk that fails for a moment.
+            // Temporary errors of the disk do not count.
             Err(_) => State::Kept,
         }
     }
 
-    /// Gives the folder back, with nothing left of the lock.
+    /// Releases the folder and removes the files of the lock.
     pub fn remove(self) {
         remove(&[self.path.clone(), owner_of(&self.path)]);
     }
@@ -103,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn lock_is_one_programs_until_it_is_dropped() {
+    fn take_while_locked_fails_until_drop() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("lock");
         let first = take(&path).unwrap();
@@ -120,12 +122,12 @@ mod tests {
     }
 
     #[test]
-    fn lock_of_a_folder_that_was_replaced_is_lost() {
+    fn state_of_replaced_folder_is_lost() {
         let folder = tempfile::tempdir().unwrap();
         let [run, moved] = ["run", "moved"].map(|name| folder.path().join(name));
         std::fs::create_dir(&run).unwrap();
         let first = take(&run.join("lock")).unwrap();
-        // Its owner file is that of another program, as in a folder that took its place.
+        // The owner file names another program, as in a folder that replaced this one.
         let owner = owner_of(&run.join("lock"));
         let own = std::fs::read(&owner).unwrap();
         std::fs::write(&owner, "1 0123456789abcdef\n").unwrap();
@@ -134,7 +136,7 @@ mod tests {
         assert_eq!(first.state(), State::Kept);
         std::fs::remove_file(&owner).unwrap();
         assert_eq!(first.state(), State::Gone);
-        // What cannot be read for another reason says nothing.
+        // Other errors of reading do not change the state.
         std::fs::create_dir(&owner).unwrap();
         assert_eq!(first.state(), State::Kept);
         drop(first);
@@ -148,7 +150,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn lock_of_a_moved_folder_is_not_that_of_the_next() {
+    fn take_at_path_of_moved_folder_succeeds() {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path().join("run");
         let make = || {
@@ -164,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn without_locks_the_last_one_has_the_folder() {
+    fn take_without_locks_gives_the_last_one_the_folder() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("lock");
         let none = |_: &File| Err(TryLockError::Error(std::io::Error::from(ErrorKind::Unsupported)));
@@ -177,7 +179,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn files_that_links_lead_to_stay_as_they_are() {
+    fn take_through_link_keeps_the_target() {
         let folder = tempfile::tempdir().unwrap();
         let [notes, path] = ["notes.txt", "lock"].map(|name| folder.path().join(name));
         std::fs::write(&notes, b"mine").unwrap();

@@ -1,4 +1,4 @@
-//! What figures were measured on.
+//! Properties of the machine and of the process, for results.
 
 use raygrad::tensor::simd;
 
@@ -19,40 +19,40 @@ pub fn describe() -> Vec<[String; 2]> {
     rows
 }
 
-/// The name of the processor, where the system says so.
+/// The processor's name, if the system reports it.
 pub fn processor() -> String {
     proc_value("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".to_owned())
 }
 
-/// The most memory that this program has had at once, in bytes, where the system says so.
+/// Peak memory of this process in bytes, if the system reports it.
 pub fn peak_memory() -> Option<u64> {
     proc_bytes("/proc/self/status", "VmHWM")
 }
 
-/// The memory that it has now.
+/// Current memory of this process in bytes, if the system reports it.
 pub fn taken_memory() -> Option<u64> {
     proc_bytes("/proc/self/status", "VmRSS")
 }
 
-/// The memory that programs may still take.
+/// Memory available to programs in bytes, if the system reports it.
 pub fn available_memory() -> Option<u64> {
     proc_bytes("/proc/meminfo", "MemAvailable")
 }
 
-/// The value after the first `name:` of a file of Linux that has it in kB, in bytes.
+/// The first `name:` value of a file in `/proc`, converted from kB to bytes.
 fn proc_bytes(file: &str, name: &str) -> Option<u64> {
     let kib: u64 = proc_value(file, name)?.strip_suffix("kB")?.trim().parse().ok()?;
     Some(1024 * kib)
 }
 
-/// The value after the first `name:` of a file of Linux.
+/// The first `name:` value of a file in `/proc`.
 fn proc_value(file: &str, name: &str) -> Option<String> {
     let text = std::fs::read_to_string(file).ok()?;
     let line = text.lines().find(|line| line.split(':').next().is_some_and(|key| key.trim() == name))?;
     Some(line.split_once(':')?.1.trim().to_owned())
 }
 
-/// The data caches of the first processor and their sizes in bytes, where the system says so.
+/// Data caches of the first processor with their sizes in bytes, if the system reports them.
 pub fn caches() -> Vec<(String, u64)> {
     let read = |index: usize, what: &str| {
         let path = format!("/sys/devices/system/cpu/cpu0/cache/index{index}/{what}");
@@ -74,11 +74,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn memory_is_counted_in_bytes() {
+    fn memory_values_are_in_bytes() {
         let before = peak_memory().unwrap();
         let block = std::hint::black_box(vec![1_u8; 1 << 28]);
         let grown = peak_memory().unwrap() - before;
-        // The peak may have been higher than what there was before it.
+        // Memory that was freed before does not raise the peak.
         assert!(before > 1 << 20 && before < 1 << 36 && grown <= block.len() as u64 + (1 << 26), "{before} {grown}");
         assert!(peak_memory().unwrap() >= block.len() as u64);
     }

@@ -1,5 +1,5 @@
-//! The command line program: parses its arguments, runs the subcommand, and turns errors into one line and an exit code. Each
-//! subcommand has a file of its own.
+//! The command line program: parses its arguments, runs the subcommand, and reports errors as one line and an exit
+//! code. Each subcommand has its own file.
 
 mod bench;
 mod builtin;
@@ -48,7 +48,7 @@ use raygrad::tensor::simd;
 use interrupt::{Stop, Work};
 use output::{complain, print};
 
-/// How the program ends, for scripts.
+/// Help text on exit codes.
 const EXIT_CODES: &str = "\
 Exit codes:
   0    success
@@ -128,7 +128,7 @@ fn run(cli: Cli) -> Work<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// What the bare program does: trains with all defaults and renders a picture.
+/// Runs without a subcommand: trains with all defaults and renders an image.
 fn first_run() -> Work<ExitCode> {
     let trained = train::run(&train::Args::default())?;
     if !trained.interrupted && !trained.diverged {
@@ -140,7 +140,7 @@ fn first_run() -> Work<ExitCode> {
     Ok(trained.exit_code())
 }
 
-/// Prints what can be done with a run.
+/// Prints the next commands for a run.
 fn suggest(folder: &Path) -> Result<()> {
     let folder = folder.display();
     print(&format!(
@@ -165,13 +165,13 @@ mod tests {
     }
 
     #[test]
-    fn command_line_is_consistent() {
+    fn clap_definition_passes_debug_assert() {
         Cli::command().debug_assert();
         let _ = super::train::Args::default();
     }
 
     #[test]
-    fn short_help_has_one_line_an_option() {
+    fn short_help_options_have_one_line() {
         for mut command in commands() {
             let help = command.render_help().to_string();
             for line in help.lines() {
@@ -187,9 +187,9 @@ mod tests {
         }
     }
 
-    /// `UPDATE_SNAPSHOTS=1 cargo test -p raygrad-cli --bin raygrad help` writes them anew.
+    /// `UPDATE_SNAPSHOTS=1 cargo test -p raygrad-cli --bin raygrad help` updates the snapshots.
     #[test]
-    fn help_matches_its_snapshots() {
+    fn help_equals_snapshots() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/help");
         for mut command in commands() {
             let name = command.get_name().to_owned();

@@ -34,10 +34,10 @@ pub fn run(args: &Args) -> Result<()> {
     print(&format!("{} pages in {}\n", files.len(), folder.display()))
 }
 
-/// The mark of a page that was generated: its title line.
+/// The title line, which marks generated pages.
 const TITLE: &str = "\n.TH raygrad";
 
-/// Whether there is nothing at a path, or a page of raygrad.
+/// Fails if the path exists and is not a page of raygrad.
 fn check_replaceable(file: &Path) -> Result<()> {
     match std::fs::read(file) {
         Ok(bytes) if !String::from_utf8_lossy(&bytes).contains(TITLE) => {
@@ -48,7 +48,7 @@ fn check_replaceable(file: &Path) -> Result<()> {
     }
 }
 
-/// File names and pages: first that of the program, then one per command.
+/// File names and texts of the pages: the program first, then one per command.
 fn pages() -> Result<Vec<(String, String)>> {
     let mut program = Cli::command().disable_help_subcommand(true);
     program.build();
@@ -59,7 +59,7 @@ fn pages() -> Result<Vec<(String, String)>> {
         let mut text = vec![];
         man.render(&mut text).map_err(|e| Error::setting("man", e))?;
         let text = String::from_utf8(text).map_err(|e| Error::setting("man", e))?;
-        // The heading of what stands after the help of the program.
+        // The heading of the section after the options.
         Ok((format!("{name}.1"), text.replace(".SH EXTRA\nExit codes:\n", ".SH \"EXIT CODES\"\n")))
     };
     commands.into_iter().map(page).collect()
@@ -71,7 +71,7 @@ mod tests {
     use crate::tests::commands;
 
     #[test]
-    fn man_has_a_page_for_each_command_with_each_flag() {
+    fn pages_cover_all_commands_and_flags() {
         let pages = pages().unwrap();
         let names: Vec<&str> = pages.iter().map(|(name, _)| name.as_str()).collect();
         assert!(pages[0].1.contains(".SH \"EXIT CODES\""), "{}", pages[0].1);
@@ -83,7 +83,7 @@ mod tests {
             for flag in command.get_arguments().filter(|arg| !arg.is_hide_set()).filter_map(|arg| arg.get_long()) {
                 assert!(page.replace('\\', "").contains(&format!("--{flag}")), "{file}: {flag}");
             }
-            // The program's page names the others.
+            // The program's page refers to the others.
             assert!(
                 name == "raygrad" || pages[0].1.replace('\\', "").contains(&format!("raygrad-{name}(1)")),
                 "{name}"
@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn man_replaces_its_own_pages_alone() {
+    fn check_replaceable_accepts_own_pages_only() {
         let folder = tempfile::tempdir().unwrap();
         let args = Args { out: Some(folder.path().join("man1")) };
         run(&args).unwrap();

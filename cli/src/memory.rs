@@ -1,27 +1,26 @@
-//! What training takes of memory, said before it is taken.
+//! Estimates of the memory for training.
 
 use raygrad::nerf::dataset::{Dataset, Frame};
 use raygrad::nerf::{BatchSize, Trainer};
 
 use super::machine;
 
-/// Bytes that the program takes whatever it does: code, threads, what the first step sets up.
+/// Bytes of the program itself: code, threads, and initialisation in the first step.
 const PROGRAM: f64 = 1e8;
-/// Bytes for each parameter: itself, what the optimiser remembers of it, its gradient, and all of that once more while a checkpoint is
-/// written.
+/// Bytes per parameter: value, optimiser state, gradient, and a copy of all of it while a checkpoint is written.
 const PARAMETER: f64 = 40.0;
-/// Bytes for each cell of an occupancy grid.
+/// Bytes per cell of an occupancy grid.
 const CELL: f64 = 12.0;
-/// Bytes for each sample of a step, on the tape and in gradients that are not yet added up.
+/// Bytes per sample of a step, on the tape and in gradients that are not summed yet.
 const SAMPLE: f64 = 3300.0;
 
-/// About how many bytes training takes, photographs and all; `docs/benchmarks/results.md` has what it came to.
+/// Estimated bytes of training, images included. `docs/benchmarks/results.md` has the measured values.
 pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
     let model = &trainer.model;
     let cells = model.sampler.grid().map_or(0, |grid| grid.cells());
     let samples = match model.sampler.batch_size() {
         BatchSize::Samples(samples) => samples,
-        // Tapes of a few rays.
+        // The tape of a few rays is negligible.
         BatchSize::Rays { .. } => 0,
     };
     let photographs: f64 = data.frames.iter().map(bytes).sum();
@@ -30,12 +29,12 @@ pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
     PROGRAM + photographs + parts.iter().sum::<f64>()
 }
 
-/// Bytes of a photograph and of what was measured beside it.
+/// Bytes of an image and of its measured depths.
 fn bytes(frame: &Frame) -> f64 {
     (frame.image.bytes() + frame.distances.as_ref().map_or(0, |distances| 4 * distances.data.len())) as f64
 }
 
-/// Bytes that are free for programs, where the system says it: of the machine, or of the group that this one runs in.
+/// Free bytes of the machine or of the cgroup, whichever is less, if the system reports them.
 pub fn available() -> Option<f64> {
     let group = || {
         let read =
@@ -46,7 +45,7 @@ pub fn available() -> Option<f64> {
     [machine, group()].into_iter().flatten().reduce(f64::min)
 }
 
-/// What is to be said if training needs more bytes than are free.
+/// The warning if training needs more bytes than are free.
 pub fn shortage(need: f64, free: f64) -> Option<String> {
     let [needed, left] = [need, free].map(|bytes| bytes / 1e9);
     (need > free).then(|| {
@@ -67,14 +66,14 @@ mod tests {
     use std::sync::Arc;
 
     #[test]
-    fn a_warning_says_what_is_missing() {
+    fn shortage_needing_more_gives_warning() {
         assert_eq!(shortage(1e9, 1e9), None);
         let said = shortage(3.26e9, 2.5e9).unwrap();
         assert!(said.contains("about 3.3 GB of memory, but 2.5 GB are free"), "{said}");
     }
 
     #[test]
-    fn what_training_takes_grows_with_all_that_is_held() {
+    fn need_grows_with_each_component() {
         let need = |width: usize, table: u32, resolution: usize, samples: usize| {
             let mut config = Config::preset(Preset::Instant);
             if let Some(field) = config.field.get_mut::<InstantConfig>() {
@@ -90,7 +89,7 @@ mod tests {
         let (least, elements) = need(8, 8, 16, 1024);
         let least_of = |other: (f64, f64)| other.0 - least;
         let pixels = 60.0 * (16.0 * 16.0 - 8.0 * 8.0);
-        // Four channels of single precision, as they were rendered.
+        // Four channels of single precision.
         assert!((least_of(need(16, 8, 16, 1024)) / pixels - 16.0).abs() < 0.01);
         let (more, all) = need(8, 12, 16, 1024);
         assert!(all > elements && (more - least - PARAMETER * (all - elements)).abs() < 1.0);

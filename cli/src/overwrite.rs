@@ -1,7 +1,7 @@
-//! Which files a command may replace: those that it wrote itself, and with `--overwrite` all.
+//! Overwrite protection. A command may replace its own files, and any file with `--overwrite`.
 //!
-//! A command writes a mark into its files, a number of all that it was asked for: so that it works again on its own output, and
-//! replaces nothing else.
+//! A command writes a mark into its files: a checksum of its arguments. So the same command may replace its output, but
+//! no other file.
 
 use std::fs::File;
 use std::io::{ErrorKind, Read};
@@ -11,47 +11,48 @@ use crc::{CRC_64_XZ, Crc};
 use raygrad::nerf::{Error, Result};
 use serde_json::Value;
 
-/// What a command was asked for, but for where to write it.
+/// The arguments of a command, except for the output path.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Job {
     mark: String,
-    /// Whether everything may be replaced.
+    /// True if everything may be replaced.
     overwrites: bool,
 }
 
-/// Bytes at the beginning of a file in which a mark is looked for: before them come at most the tables of a long video.
+/// Bytes at the beginning of a file that are searched for a mark. In a long video, tables come before it.
 const SEARCHED: u64 = 16 << 20;
-/// Bytes that are read at a time.
+/// Bytes per read.
 const BLOCK: usize = 1 << 16;
 
 impl Job {
-    /// Of a subcommand with these arguments.
+    /// Creates the job of a subcommand with these arguments.
     pub fn new(command: &str, arguments: &Value, overwrites: bool) -> Self {
         let number = Crc::<u64>::new(&CRC_64_XZ).checksum(arguments.to_string().as_bytes());
         Job { mark: format!("raygrad-{command}-{number:016x}"), overwrites }
     }
 
-    /// What stands in files that this job has written.
+    /// The mark of files that this job writes.
     pub fn mark(&self) -> &str {
         &self.mark
     }
 
-    /// Whether everything may be replaced.
+    /// Returns true if everything may be replaced.
     pub fn overwrites(&self) -> bool {
         self.overwrites
     }
 
-    /// Whether a file carries the mark.
+    /// Returns true if a file contains the mark.
     pub fn wrote(&self, file: &Path) -> bool {
-        // What cannot be read is nobody's own, and a pipe is not waited for.
+        // Unreadable files count as unmarked. Reading a pipe would block.
         let open = || File::open(file).and_then(|file| contains(file.take(SEARCHED), self.mark.as_bytes()));
         file.is_file() && open().unwrap_or(false)
     }
 
-    /// Whether a file may be written: asked before the work that it will hold, and once more before it is replaced.
+    /// Checks that a file may be written. Called before the work, and again before the file is replaced.
     ///
     /// # Errors
-    /// If it is a folder, or there is a file that this job has not written and may not replace.
+    ///
+    /// Fails if it is a folder, or a file of another job that this one may not replace.
     pub fn check(&self, out: &Path) -> Result<()> {
         match std::fs::symlink_metadata(out) {
             Err(e) if e.kind() == ErrorKind::NotFound => Ok(()),
@@ -63,12 +64,12 @@ impl Job {
     }
 }
 
-/// The error that a file is in the way.
+/// The error for an existing file.
 pub fn taken(file: &Path) -> Error {
     Error::file(file, "exists, and another command or other options made it: choose another output or add --overwrite")
 }
 
-/// Whether bytes hold a word.
+/// Returns true if the stream contains a word.
 fn contains(mut from: impl Read, word: &[u8]) -> std::io::Result<bool> {
     let mut bytes = vec![];
     loop {
@@ -80,14 +81,14 @@ fn contains(mut from: impl Read, word: &[u8]) -> std::io::Result<bool> {
         if bytes.len() == kept {
             return Ok(false);
         }
-        // It may begin in one block and end in the next.
+        // The word may span two blocks.
         bytes.drain(..(bytes.len() + 1).saturating_sub(word.len()));
     }
 }
 
-/// A PNG file with a text about it, which is Latin-1.
+/// Adds a Latin-1 text to a PNG file.
 pub fn png_with_text(png: &[u8], text: &str) -> Vec<u8> {
-    /// The signature and the first chunk, after which others may come.
+    /// Length of the signature and of the first chunk. Other chunks may follow them.
     const HEADER: usize = 8 + 25;
     let body = [b"tEXtComment\0", text.as_bytes()].concat();
     let chunk = [&((body.len() - 4) as u32).to_be_bytes(), &body[..], &crc32fast::hash(&body).to_be_bytes()].concat();
@@ -102,7 +103,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn contains_finds_words_across_blocks() {
+    fn contains_word_across_blocks_is_found() {
         let word = b"raygrad-render-0123456789abcdef";
         for at in [0, 1, BLOCK - 1, BLOCK - word.len(), BLOCK - word.len() / 2, BLOCK, 3 * BLOCK - 2] {
             let mut bytes = vec![b'r'; 3 * BLOCK + 100];
@@ -116,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn job_replaces_its_own_files_alone() {
+    fn check_accepts_files_of_the_same_job() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.png");
         let job = |size: u32, overwrites: bool| Job::new("render", &json!({ "size": size }), overwrites);
@@ -132,7 +133,7 @@ mod tests {
         let [text] = &reader.info().uncompressed_latin1_text[..] else { panic!("one text") };
         assert_eq!((&text.keyword[..], &text.text[..]), ("Comment", own.mark()));
         assert!(own.check(&path).is_ok() && job(1, false) == own);
-        // Another one's, and a photograph.
+        // Files of another job, and other images.
         let refused = |job: Job| job.check(&path).unwrap_err().to_string();
         let expected = "exists, and another command or other options made it: choose another output or add --overwrite";
         assert_eq!(refused(job(2, false)), format!("{}: {expected}", path.display()));
@@ -141,20 +142,20 @@ mod tests {
         assert!(refused(own.clone()).ends_with(expected));
         assert!(job(2, true).check(&path).is_ok());
         assert!(job(2, true).check(folder.path()).unwrap_err().to_string().ends_with("is a folder, not a file"));
-        // A mark may stand behind the tables of a long video, and not anywhere.
+        // In a long video, the mark follows the tables, within the limit.
         for (at, wrote) in [(15 << 20, true), (17 << 20, false)] {
             let video = [vec![0; at], own.mark().as_bytes().to_vec()].concat();
             std::fs::write(&path, video).unwrap();
             assert_eq!(own.wrote(&path), wrote);
         }
-        // A pipe is not waited for.
+        // A pipe does not block.
         #[cfg(unix)]
         {
             let pipe = folder.path().join("pipe.png");
             let made = std::process::Command::new("mkfifo").arg(&pipe).status();
             assert!(made.is_err() || own.check(&pipe).is_err());
         }
-        // Nor is a link that leads nowhere replaced.
+        // Dangling links are not replaced.
         #[cfg(unix)]
         {
             let link = folder.path().join("link.png");

@@ -1,4 +1,4 @@
-//! Values on the command line: counts, durations and image sizes.
+//! Values on the command line: numbers, durations, sizes and colours.
 
 use std::fmt::Display;
 use std::ops::Bound::Included;
@@ -8,12 +8,12 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-/// A whole number from 1 to `most`.
+/// Parses an integer from 1 to `most`.
 pub fn count(most: usize) -> impl Fn(&str) -> Result<usize, String> + Clone + Send + Sync + 'static {
     within(1..=most)
 }
 
-/// A whole number in a range, which has a first number.
+/// Parses an integer in a range with a lower bound.
 pub fn within<N, R>(range: R) -> impl Fn(&str) -> Result<N, String> + Clone + Send + Sync + 'static
 where
     N: FromStr + PartialOrd + Display + 'static,
@@ -30,7 +30,7 @@ where
     }
 }
 
-/// A duration such as `90s`, `10m` or `1.5h`.
+/// Parses a duration such as `90s`, `10m` or `1.5h`.
 pub fn duration(text: &str) -> Result<Duration, String> {
     let usage = || "write a number and a unit: 90s, 10m or 1.5h".to_owned();
     let (number, unit) = text.char_indices().next_back().map(|(last, _)| text.split_at(last)).ok_or_else(usage)?;
@@ -47,19 +47,19 @@ pub fn duration(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// Most pixels on a side of an image.
+/// Largest side of an image in pixels.
 pub const LARGEST: usize = 16384;
 
-/// Frames a second that files of videos can say.
+/// Frames per second that video formats support.
 pub const FPS: RangeInclusive<f64> = 0.01..=240.0;
 
-/// Frames a second.
+/// Parses frames per second.
 pub fn fps(text: &str) -> Result<f64, String> {
     let usage = || format!("write a number from {} to {}", FPS.start(), FPS.end());
     text.parse().ok().filter(|fps| FPS.contains(fps)).ok_or_else(usage)
 }
 
-/// Width and height, such as `400x300`.
+/// Parses a width and a height, such as `400x300`.
 pub fn size(text: &str) -> Result<[usize; 2], String> {
     let usage = || format!("write WIDTHxHEIGHT such as 400x300, each from 1 to {LARGEST}");
     let (width, height) = text.split_once('x').ok_or_else(usage)?;
@@ -67,7 +67,7 @@ pub fn size(text: &str) -> Result<[usize; 2], String> {
     Ok([side(width)?, side(height)?])
 }
 
-/// The proportions of an image, such as `16:9`: width over height.
+/// Parses an aspect ratio, such as `16:9`: width over height.
 pub fn aspect(text: &str) -> Result<f64, String> {
     let usage = || "write WIDTH:HEIGHT such as 16:9, from 1:20 to 20:1".to_owned();
     let (width, height) = text.split_once(':').ok_or_else(usage)?;
@@ -75,7 +75,8 @@ pub fn aspect(text: &str) -> Result<f64, String> {
     Some(side(width)? / side(height)?).filter(|aspect| (0.05..=20.0).contains(aspect)).ok_or_else(usage)
 }
 
-/// A color: `white`, `black`, or red, green and blue from 0 to 255, such as `255,200,0`; as 0 to 1.
+/// Parses a colour: `white`, `black`, or red, green and blue from 0 to 255, such as `255,200,0`. The result is in 0 to
+/// 1.
 pub fn color(text: &str) -> Result<[f32; 3], String> {
     let usage = || "write white, black or R,G,B such as 255,200,0, each from 0 to 255".to_owned();
     match text {
@@ -88,12 +89,12 @@ pub fn color(text: &str) -> Result<[f32; 3], String> {
     values.try_into().map_err(|_| usage())
 }
 
-/// A finite number above 0.
+/// Parses a finite number above 0.
 pub fn above_zero(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|x: &f64| *x > 0.0 && x.is_finite()).ok_or_else(|| "write a number above 0".to_owned())
 }
 
-/// A number between two others, and none of them.
+/// Parses a number between two others, exclusive.
 pub fn between(least: f64, most: f64) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync + 'static {
     move |text| {
         let inside = |x: &f64| least < *x && *x < most;
@@ -101,14 +102,14 @@ pub fn between(least: f64, most: f64) -> impl Fn(&str) -> Result<f64, String> + 
     }
 }
 
-/// `NAME=VALUE`; the value is JSON, or else a plain word.
+/// Parses `NAME=VALUE`. The value is JSON, or else a plain word.
 pub fn setting(text: &str) -> Result<(String, Value), String> {
     let (name, value) = text.split_once('=').ok_or("write NAME=VALUE")?;
     let value = serde_json::from_str(value).unwrap_or_else(|_| Value::String(value.to_owned()));
     Ok((name.to_owned(), value))
 }
 
-/// `NAME=WEIGHT`, a number of at least 0.
+/// Parses `NAME=WEIGHT`. The weight is 0 or more.
 pub fn weight(text: &str) -> Result<(String, f64), String> {
     let usage = || "write NAME=WEIGHT such as entropy=0.001".to_owned();
     let (name, weight) = text.split_once('=').ok_or_else(usage)?;
@@ -121,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn whole_numbers() {
+    fn count_and_within_parse_or_refuse() {
         let keep = within(2..=16384usize);
         assert_eq!((keep("2"), keep("16384")), (Ok(2), Ok(16384)));
         for bad in ["", "1", "16385", "-2", "2.5", "1e3", "99999999999999999999"] {
@@ -134,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn durations() {
+    fn duration_parses_or_refuses() {
         assert_eq!(duration("90s"), Ok(Duration::from_secs(90)));
         assert_eq!(duration("1.5m"), Ok(Duration::from_secs(90)));
         assert_eq!(duration("1h"), Ok(Duration::from_secs(3600)));
@@ -144,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn sizes() {
+    fn size_parses_or_refuses() {
         assert_eq!(size("400x300"), Ok([400, 300]));
         for bad in ["", "x", "400", "0x0", "400x0", "-1x5", "4x3x2", "16385x1", "99999999999999999999x1"] {
             assert!(size(bad).is_err(), "{bad}");
@@ -152,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn proportions_and_colors_and_numbers_in_a_range() {
+    fn aspect_color_and_between_parse_or_refuse() {
         assert_eq!((aspect("16:10"), aspect("1:2.5")), (Ok(1.6), Ok(0.4)));
         for bad in ["", "16", "16:0", ":", "-1:2", "NaN:1", "1:inf", "21:1", "1:2:3"] {
             assert!(aspect(bad).is_err(), "{bad}");

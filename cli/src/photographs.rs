@@ -1,4 +1,4 @@
-//! The photographs of a run, without their pictures.
+//! Cameras of a run's images, without the pixels.
 
 use raygrad::nerf::dataset::{Capture, Split, View};
 use raygrad::nerf::{Camera, Error, Model, Result};
@@ -7,19 +7,20 @@ use super::builtin;
 use super::run::Run;
 use super::scene::Scene;
 
-/// A photograph, in the scene's coordinates.
+/// An image's camera in scene coordinates.
 pub struct Photograph {
     pub name: String,
-    /// Where the model has it.
+    /// The camera, with pose refinement.
     pub camera: Camera,
-    /// The nearest and the farthest depth that it shows, if that is known.
+    /// Nearest and farthest visible depth, if known.
     pub bounds: Option<[f64; 2]>,
 }
 
-/// Those of a split, at least one, in the order in which they are read. No image is read.
+/// The images of a split, at least one, in order of loading. Reads no pixels.
 ///
 /// # Errors
-/// If the capture cannot be read, or has none; or to train on others than the run was trained on.
+///
+/// Fails if the capture cannot be read, the split has no images, or the training images differ from those of the run.
 pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: Split) -> Result<Vec<Photograph>> {
     let capture = builtin::capture(run.scene(scene)?, None, None)?;
     let views = present(&capture, split)?;
@@ -43,26 +44,25 @@ pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: 
     Ok(views.iter().zip(cameras).map(photograph).collect())
 }
 
-/// The depths that a view shows at most, in scene units, of which one of the capture's has `scale`.
+/// Near and far depth of a view in scene units. `scale` is the scale of the scene transform.
 fn bounds(view: &View, scale: f64) -> Option<[f64; 2]> {
     view.bounds.map(|ends| ends.map(|end| scale * end))
 }
 
-/// The views of a split whose photographs are there, in the order in which these are read, which numbers them. Of a built-in
-/// scene all are.
+/// The views of a split whose image files exist, in order of loading, which numbers them. Built-in scenes have all.
 pub fn present(capture: &Capture, split: Split) -> Result<Vec<&View>> {
     let is_made = capture.present().next().is_none();
     Ok(capture.split(split)?.into_iter().filter(|view| is_made || view.image.is_some()).collect())
 }
 
-/// Whether these views to train on are the `count` photographs that a run was trained on; of 0, that is not known.
+/// Fails if the training views differ from the `count` images that the run was trained on. A count of 0 is unknown.
 pub fn check_trained(run: &Run, capture: &Capture, views: &[&View], count: usize) -> Result<()> {
     let bad = |what: String| Err(Error::file(&capture.file, format!("{what}: name their folder with --scene")));
     if count > 0 && views.len() != count {
         return bad(format!("has {} training images, and the run was trained on {count}", views.len()));
     }
     let (names, is_made) = (&run.config.photographs, capture.present().next().is_none());
-    // Runs of the first edition have no names, and those of built-in scenes have others.
+    // Runs of the first version have no names, and names of built-in scenes differ.
     if !is_made && !names.is_empty() && !views.iter().map(|view| &view.name).eq(names) {
         return bad("has other training images than the run was trained on".to_owned());
     }
@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn depths_are_in_scene_units() {
+    fn bounds_are_in_scene_units() {
         let mut capture = builtin::capture(&Scene::Embedded, None, None).unwrap();
         let mut view = capture.views.remove(0);
         assert_eq!(bounds(&view, 3.0), None);

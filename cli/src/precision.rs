@@ -1,10 +1,10 @@
-//! Rendering in single precision, as fast as the model allows, or in double precision with nothing left out.
+//! Rendering in single precision with skipping, or in double precision without skipping.
 
 use clap::ValueEnum;
 use raygrad::nerf::{Camera, Image, Model, Render, Result};
 use serde::Serialize;
 
-/// The arithmetic of a picture.
+/// Arithmetic of a render.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
@@ -15,11 +15,11 @@ pub enum Precision {
     F64,
 }
 
-/// A model in the precision that it is rendered in.
+/// A model in the precision of its renders.
 pub enum Renderer {
-    /// As trained.
+    /// The trained model.
     Single(Box<Model<f32>>),
-    /// The same numbers, and all arithmetic on them in f64.
+    /// The same parameters with f64 arithmetic.
     Double(Box<Model<f64>>),
 }
 
@@ -32,7 +32,7 @@ impl Renderer {
         })
     }
 
-    /// Lets views look like the photograph of this number, or like none in particular.
+    /// Sets the appearance embedding to that of this image, or to none.
     pub fn look_like(&mut self, number: Option<u32>) {
         match self {
             Renderer::Single(model) => model.appearance_image = number,
@@ -40,7 +40,7 @@ impl Renderer {
         }
     }
 
-    /// The view from a camera over a background.
+    /// Renders the view of a camera over a background.
     pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Render {
         match self {
             Renderer::Single(model) => model.render(camera, background),
@@ -48,7 +48,7 @@ impl Renderer {
         }
     }
 
-    /// The normals that are seen from a camera: see [`Model::normals`].
+    /// Renders the normals from a camera: see [`Model::normals`].
     pub fn normals(&self, camera: &Camera) -> Image {
         match self {
             Renderer::Single(model) => model.normals(camera),

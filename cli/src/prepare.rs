@@ -1,4 +1,4 @@
-//! `raygrad prepare`: a dataset of a video, of photographs, or of another dataset.
+//! `raygrad prepare`: makes a dataset from a video, images, or another dataset.
 
 mod bounds;
 pub mod convert;
@@ -24,7 +24,7 @@ use super::{builtin, doctor, interrupt};
 use convert::Target;
 use workplace::Workplace;
 
-/// Names of photographs that are said, before it is only said how many more there are.
+/// Names of images in a message. Further ones are counted.
 const NAMED: usize = 8;
 
 /// Make a dataset from a video, images or a dataset
@@ -87,7 +87,7 @@ enum Glass {
 }
 
 impl Glass {
-    /// COLMAP's name.
+    /// COLMAP's name of the camera model.
     fn model(self) -> &'static str {
         match self {
             Glass::Perspective => "OPENCV",
@@ -96,7 +96,7 @@ impl Glass {
     }
 }
 
-/// Makes the dataset.
+/// Runs the command.
 pub fn run(args: &Args) -> Work<()> {
     interrupt::listen_to_remove();
     match (args.to, args.undistort) {
@@ -114,7 +114,7 @@ pub fn run(args: &Args) -> Work<()> {
     Ok(())
 }
 
-/// Of a video or photographs.
+/// Makes a dataset from a video or images.
 fn prepare(args: &Args) -> Work<()> {
     let input = &args.input;
     if !matches!(Scene::from(input.clone().into_os_string()), Scene::Folder(_)) {
@@ -129,7 +129,7 @@ fn prepare(args: &Args) -> Work<()> {
         let what = "already has camera poses: train on it, or choose a format to convert it to with --to";
         return Err(Error::file(input, what).into());
     }
-    // The input first: nobody should install a program for a folder without images.
+    // Checks the input first: a folder without images needs no COLMAP.
     let images = if is_video { vec![] } else { photographs::find(input)? };
     if is_video {
         photographs::check_no_image(input)?;
@@ -146,7 +146,7 @@ fn prepare(args: &Args) -> Work<()> {
     let found = poses::find(&place, is_video, args.lens.model())?;
     place.finish()?;
     report(&found, count, &args.out)?;
-    // The dataset is there whatever is found in it.
+    // The dataset is complete, so errors of the check are only warnings.
     let (scene, out) = (Scene::Folder(args.out.clone()), args.out.join("doctor"));
     if let Err(error) = doctor::run(&doctor::Args { scene, scene_type: None, out, overwrite: false, json: false }) {
         complain(&format!("warning: {error}"));

@@ -1,4 +1,4 @@
-//! Pictures of one view while a model learns.
+//! Preview renders of one view during training.
 
 use raygrad::nerf::dataset::{Dataset, Frame, Split};
 use raygrad::nerf::imaging::metrics::psnr;
@@ -7,14 +7,14 @@ use raygrad::nerf::{Camera, Image, Model};
 use super::output::complain;
 use super::scene::Opened;
 
-/// Longest side of a preview in pixels: it is to be quick.
+/// Longest side of a preview in pixels, for speed.
 const LONGEST: usize = 128;
 
-/// A photograph to render again and again.
+/// The image whose view is rendered repeatedly.
 pub struct Preview {
-    /// The photograph's name.
+    /// Name of the image.
     pub name: String,
-    /// The number of the photograph, if it is trained on.
+    /// Index of the image, if it is a training image.
     number: Option<usize>,
     camera: Camera,
     truth: Image,
@@ -22,8 +22,8 @@ pub struct Preview {
 }
 
 impl Preview {
-    /// A photograph that is not trained on: of the validation split or else the test split. If there is neither, one
-    /// of the training photographs.
+    /// Chooses a held-out image: of the validation split or else of the test split. Without held-out images, uses a
+    /// training image.
     pub fn choose(scene: &Opened, downscale: usize, train: &Dataset, background: [f32; 3]) -> Self {
         let held_out = scene.load(Split::Val, downscale, 1);
         let held_out = held_out.or_else(|error| scene.load(Split::Test, downscale, 1).map_err(|_| error));
@@ -40,7 +40,7 @@ impl Preview {
         let factor = frame.image.width.max(frame.image.height).div_ceil(LONGEST);
         let truth = cropped_to_multiple(&frame.image.to_image(), factor).downscaled(factor).over(background);
         let scale = 1.0 / factor as f64;
-        // Columns and rows are cut off at the right and at the bottom, where they do not move the principal point.
+        // Cropping at the right and at the bottom keeps the principal point.
         let camera = Camera {
             width: truth.width,
             height: truth.height,
@@ -51,14 +51,14 @@ impl Preview {
         Preview { name: frame.name.clone(), number, camera, truth, background }
     }
 
-    /// Whether the photograph is not trained on.
+    /// Returns true if the image is held out.
     pub fn is_held_out(&self) -> bool {
         self.number.is_none()
     }
 
-    /// What the model sees next to the photograph, and its PSNR in dB.
+    /// Renders the view beside the image, and returns its PSNR in dB.
     pub fn show(&self, model: &Model<f32>) -> (Image, f64) {
-        // Where the model has found the camera to be, if it looks for it.
+        // For a training image, the camera with pose refinement.
         let camera = match self.number {
             Some(number) => model.learned_camera(number, &self.camera),
             None => model.other_camera(&self.camera),
@@ -68,9 +68,9 @@ impl Preview {
     }
 }
 
-/// The image without the columns and rows at its right and bottom that are no whole multiple of `factor`.
+/// Crops columns at the right and rows at the bottom to a multiple of `factor`.
 fn cropped_to_multiple(image: &Image, factor: usize) -> Image {
-    // A side shorter than the factor is left to be one pixel, repeated.
+    // A side shorter than the factor becomes one pixel, by repetition.
     let side = |length: usize| (length / factor).max(1) * factor;
     let mut out = Image::new(side(image.width), side(image.height), image.channels);
     for y in 0..out.height {
@@ -87,7 +87,7 @@ mod tests {
     use raygrad_scenes::embedded;
 
     #[test]
-    fn a_preview_sees_what_the_photograph_saw() {
+    fn preview_camera_matches_the_image() {
         let frame = &embedded(Split::Val, 300).frames[0];
         let preview = Preview::new(frame, None, [1.0; 3]);
         assert_eq!([preview.truth.width, preview.truth.height], [100, 100]);
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn odd_sizes_are_cropped() {
+    fn crop_odd_size_is_a_multiple() {
         let mut image = Image::new(5, 1, 1);
         image.data = vec![1.0, 2.0, 3.0, 4.0, 5.0];
         let cropped = cropped_to_multiple(&image, 2);

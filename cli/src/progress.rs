@@ -1,4 +1,4 @@
-//! How far along a long task is, on standard error: a bar on a terminal, a line now and then elsewhere.
+//! Progress of long tasks on standard error: a bar on a terminal, periodic lines elsewhere.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -10,19 +10,19 @@ use raygrad::tensor::parallel;
 use super::interrupt::{self, Stop, Work};
 use super::output;
 
-/// Parts of the bar.
+/// Resolution of the bar.
 const PARTS: u64 = 1000;
-/// Time between lines where there is no bar.
+/// Time between lines if there is no bar.
 const INTERVAL: Duration = Duration::from_secs(5);
 
-/// A progress display, which threads may share; dropping it clears the bar.
+/// A progress display that threads can share. Dropping it clears the bar.
 pub struct Progress {
     bar: ProgressBar,
     last_line: Mutex<Instant>,
 }
 
 impl Progress {
-    /// A display at 0.
+    /// Creates a display at 0.
     pub fn new() -> Self {
         let bar = ProgressBar::with_draw_target(Some(PARTS), ProgressDrawTarget::stderr());
         let style = ProgressStyle::with_template("{wide_bar:.cyan/dim} {percent:>3} %  {msg}");
@@ -30,7 +30,7 @@ impl Progress {
         Progress { bar, last_line: Mutex::new(Instant::now()) }
     }
 
-    /// Shows that `fraction` of the task is done, and a few words.
+    /// Shows that `fraction` of the task is done, with a text.
     pub fn set(&self, fraction: f64, words: impl FnOnce() -> String) {
         let mut last_line = self.last_line.lock().unwrap_or_else(PoisonError::into_inner);
         if !self.bar.is_hidden() {
@@ -42,16 +42,17 @@ impl Progress {
         }
     }
 
-    /// Shows `3 of 12` and the words.
+    /// Shows `3 of 12` and the text.
     pub fn count(&self, done: usize, total: usize, words: &str) {
         self.set(done as f64 / total as f64, || format!("{done} of {total} {words}"));
     }
 
-    /// Does `total` pieces of work in parallel, and shows how many are done, as [`count`](Self::count) does.
+    /// Runs `total` tasks in parallel and shows the number of finished ones, like [`count`](Self::count).
     ///
     /// # Errors
-    /// The first of the pieces' own errors, by their numbers, when all have ended; or [`Stop::Interrupted`] after a Ctrl-C, when no
-    /// piece is begun any more.
+    ///
+    /// Returns the first error by task number after all tasks have ended. After a Ctrl-C no task starts, and the error
+    /// is [`Stop::Interrupted`].
     pub fn each<R: Send>(&self, total: usize, words: &str, work: impl Fn(usize) -> Work<R> + Sync) -> Work<Vec<R>> {
         let done = AtomicUsize::new(0);
         let results = parallel::collect(total, |i| {
@@ -65,7 +66,7 @@ impl Progress {
         results.into_iter().collect()
     }
 
-    /// Shows a line that stays.
+    /// Prints a permanent line.
     pub fn note(&self, line: &str) {
         self.bar.suspend(|| output::note(line));
     }
@@ -77,7 +78,7 @@ impl Drop for Progress {
     }
 }
 
-/// A duration as people say it: `42 s`, `3 min 20 s`, `2 h 05 min`.
+/// A duration as text: `42 s`, `3 min 20 s`, `2 h 05 min`.
 pub fn spoken(seconds: f64) -> String {
     let seconds = seconds.round() as u64;
     match seconds {
@@ -92,7 +93,7 @@ mod tests {
     use super::spoken;
 
     #[test]
-    fn durations_are_spoken() {
+    fn spoken_duration_has_two_units() {
         assert_eq!(spoken(0.4), "0 s");
         assert_eq!(spoken(59.6), "1 min 00 s");
         assert_eq!(spoken(200.0), "3 min 20 s");

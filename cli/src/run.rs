@@ -1,5 +1,5 @@
-//! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `summary.json`, `lock`, if it
-//! was asked for `tensorboard/`, and later results of `raygrad eval`, pictures, and the videos of `raygrad view` in `videos/`.
+//! Files of a run: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `summary.json`,
+//! `lock`. Optional: `tensorboard/`, results of `raygrad eval`, renders, and the videos of `raygrad view` in `videos/`.
 
 use std::fs::DirEntry;
 use std::io::ErrorKind;
@@ -15,17 +15,17 @@ use super::lock::{Lock, State};
 use super::output::{make_folder, parent, remove};
 use super::scene::Scene;
 
-/// Where a run goes that has been given no name; the next ones go to `run-2`, `run-3` ...
+/// Default folder of a run. Further runs use `run-2`, `run-3` ...
 const DEFAULT: &str = "run";
 
-/// The file by which a program keeps others out of a run, and the one that names it ([`Lock`]).
+/// File of the run's [`Lock`].
 const LOCK: &str = "lock";
 const OWNER: &str = "lock.owner";
 
-/// How many checkpoints may stay; the least if nothing is said: if the last is damaged, there is the one before.
+/// Numbers of checkpoints to keep. The minimum is the default: the second one is the backup of a damaged last one.
 pub const CHECKPOINTS: RangeInclusive<usize> = 2..=1 << 14;
 
-/// What training writes in a run's folder, and evaluations beside it (`eval-..`).
+/// Files that training writes in a run's folder. Evaluations (`eval-..`) are added to them.
 const OWN: [&str; 9] = [
     "config.json",
     "model.safetensors",
@@ -38,7 +38,7 @@ const OWN: [&str; 9] = [
     "tensorboard",
 ];
 
-/// What a run is about: `config.json`.
+/// Configuration of a run: `config.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
@@ -66,7 +66,7 @@ pub struct RunConfig {
     pub config: Config,
 }
 
-/// How many checkpoints stay if nothing is said.
+/// Default number of checkpoints to keep.
 pub fn usual_checkpoints() -> usize {
     *CHECKPOINTS.start()
 }
@@ -74,17 +74,18 @@ pub fn usual_checkpoints() -> usize {
 /// A run on disk.
 #[derive(Debug, Clone)]
 pub struct Run {
-    /// Its folder.
+    /// The folder.
     pub folder: PathBuf,
-    /// The contents of its `config.json`.
+    /// The contents of `config.json`.
     pub config: RunConfig,
 }
 
 impl Run {
-    /// Makes the folder of a new run, which [`choose_folder`] has found to be free, and [locks](Self::lock) it.
+    /// Creates and [locks](Self::lock) the folder of a new run, which [`choose_folder`] has chosen.
     ///
     /// # Errors
-    /// If it cannot be written, or another program has begun a run there meanwhile.
+    ///
+    /// Fails if it is not writable, or another program has created a run there meanwhile.
     pub fn create(folder: PathBuf, config: RunConfig) -> Result<(Run, Lock)> {
         make_folder(&folder)?;
         let run = Run { folder, config };
@@ -96,12 +97,12 @@ impl Run {
         Ok((run, lock))
     }
 
-    /// Writes its `config.json`.
+    /// Writes `config.json`.
     pub fn write(&self) -> Result<()> {
         write_json(&self.file("config.json"), &self.config)
     }
 
-    /// The run in a folder.
+    /// Opens the run in a folder.
     pub fn open(folder: &Path) -> Result<Run> {
         if !folder.is_dir() {
             let what = if folder.exists() { "is not a folder" } else { "there is no such folder" };
@@ -128,16 +129,17 @@ impl Run {
         Ok(Run { folder: folder.into(), config })
     }
 
-    /// Keeps other programs from training this run.
+    /// Locks the run against training by other programs.
     pub fn lock(&self) -> Result<Lock> {
         Lock::take(&self.file(LOCK), || Error::file(&self.folder, "another raygrad is training it: wait until it ends"))
     }
 
-    /// Asked before each write: whether the folder is still the one that was locked. One that was removed or moved is made again,
-    /// with its `config.json`, and this is `true` then.
+    /// Checks before each write that this program still owns the folder. If the folder was removed or moved, creates it
+    /// again with `config.json` and returns true.
     ///
     /// # Errors
-    /// If another program has the folder now, or one at its path, or it cannot be made again.
+    ///
+    /// Fails if another program owns the folder or its path, or it cannot be created.
     pub fn keep(&self, lock: &mut Lock) -> Result<bool> {
         let lost = || {
             let what = "training stopped: another raygrad now uses this folder. This one wrote nothing more to it. \
@@ -158,35 +160,35 @@ impl Run {
         Ok(true)
     }
 
-    /// Removes what a program that was killed was about to write.
+    /// Removes temporary files of a killed program.
     pub fn sweep(&self) {
         let folders = ["", "checkpoints", "previews", "tensorboard"].map(|name| self.file(name));
         let entries = folders.into_iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten().flatten();
         remove(&entries.filter(is_unfinished).map(|entry| entry.path()).collect::<Vec<_>>());
     }
 
-    /// The path of one of the run's files.
+    /// The path of a file of the run.
     pub fn file(&self, name: &str) -> PathBuf {
         self.folder.join(name)
     }
 
-    /// What its folder is called, wherever that is.
+    /// The name of the folder.
     pub fn name(&self) -> String {
         let whole = self.folder.canonicalize().unwrap_or_else(|_| self.folder.clone());
         whole.file_name().map_or_else(|| self.folder.display().to_string(), |name| name.to_string_lossy().into_owned())
     }
 
-    /// Where its folder is: what tells it from other runs.
+    /// The canonical path of the folder, which identifies the run.
     pub fn identity(&self) -> String {
         self.folder.canonicalize().unwrap_or_else(|_| self.folder.clone()).to_string_lossy().into_owned()
     }
 
-    /// The file that holds the parameters.
+    /// The file of the parameters.
     pub fn model_file(&self) -> PathBuf {
         self.file("model.safetensors")
     }
 
-    /// Where the photographs are: as `given`, or else where they were for training.
+    /// The scene of the images: `given`, or else the one of training.
     pub fn scene<'a>(&'a self, given: Option<&'a Scene>) -> Result<&'a Scene> {
         match (given, &self.config.scene) {
             (None, Scene::Folder(folder)) if !folder.exists() => {
@@ -196,13 +198,13 @@ impl Run {
         }
     }
 
-    /// The run's model as it was last saved.
+    /// Loads the last saved model.
     pub fn model(&self) -> Result<Model<f32>> {
         Model::load(self.model_file(), self.config.config.clone(), self.config.scene_box)
     }
 }
 
-/// The version of raygrad that a run's configuration says it was made by, if that is later than this one.
+/// The version of raygrad in a run's configuration, if it is later than this one.
 fn later_version(config: &str) -> Option<String> {
     let value: Value = serde_json::from_str(config).ok()?;
     let made_by = value.get("raygrad")?.as_str()?;
@@ -213,7 +215,7 @@ fn later_version(config: &str) -> Option<String> {
 }
 
 impl RunConfig {
-    /// Whether the numbers are usable. The model checks its own.
+    /// Fails if a number is out of range. The model checks its own numbers.
     pub fn check(&self) -> Result<()> {
         if self.downscale == 0 {
             return Err(Error::setting("downscale", "is 0; use 1 or more"));
@@ -235,12 +237,13 @@ impl RunConfig {
     }
 }
 
-/// Whether a file or a folder that is to be written is no part of a run, be it this one or another.
+/// Checks that an output path is not a file or folder of a run.
 ///
 /// # Errors
-/// If it is one: the run would be lost.
+///
+/// Fails if it is one, since the output would destroy the run.
 pub fn check_output(out: &Path) -> Result<()> {
-    // Links in it are followed; what does not exist yet is no part of anything.
+    // Links are resolved. A path that does not exist is not part of a run.
     let Ok(folder) = parent(out).canonicalize() else { return Ok(()) };
     let Some(name) = out.file_name() else { return Ok(()) };
     let (mut name, mut folder) = (PathBuf::from(name), folder.as_path());
@@ -255,15 +258,15 @@ pub fn check_output(out: &Path) -> Result<()> {
     }
 }
 
-/// Writes a value as JSON, replacing the file as a whole.
+/// Writes a value as JSON and replaces the file atomically.
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     let mut text = serde_json::to_string_pretty(value).map_err(|e| Error::file(path, e))?;
     text.push('\n');
     write_atomic(path, text.as_bytes())
 }
 
-/// Where a new run may go without harm to anything: to `wanted` or, if nothing is wanted, to the first free one of
-/// `run`, `run-2`, `run-3` ...
+/// Chooses the folder of a new run: `wanted`, or else the first free one of `run`, `run-2`, `run-3` ... An existing run
+/// is never replaced.
 pub fn choose_folder(wanted: Option<&Path>) -> Result<PathBuf> {
     if let Some(folder) = wanted {
         return match contents(folder)? {
@@ -283,7 +286,7 @@ pub fn choose_folder(wanted: Option<&Path>) -> Result<PathBuf> {
     unreachable!("there is no end to the numbers")
 }
 
-/// The error for a folder that holds a run: one that is being trained would come back when it is removed.
+/// The error for a folder that holds a run. A run in training would create its folder again after removal.
 fn holds_a_run(folder: &Path) -> Error {
     match Lock::is_taken(&folder.join(LOCK)) {
         true => Error::file(folder, "another raygrad is training it: stop that one or choose another --out"),
@@ -295,19 +298,19 @@ fn holds_other_files(folder: &Path) -> Error {
     Error::file(folder, "holds files that do not belong to a run: choose another folder with --out")
 }
 
-/// Whether a file is all that a program has left that was ended before its run began.
+/// Returns true for files that a program leaves if it ends before its run begins.
 fn is_nothing(entry: &DirEntry) -> bool {
     is_unfinished(entry) || [LOCK, OWNER].iter().any(|name| entry.file_name() == *name)
 }
 
-/// Whether a file is one that was about to be written and to get its name.
+/// Returns true for temporary files of unfinished writes.
 fn is_unfinished(entry: &DirEntry) -> bool {
     entry.file_name().to_string_lossy().starts_with(".tmp")
 }
 
-/// What there is at a path.
+/// Contents of a path.
 enum Contents {
-    /// Nothing, or a folder without anything finished.
+    /// Nothing, or a folder without finished files.
     Nothing,
     Run,
     Other,
@@ -318,7 +321,7 @@ fn contents(folder: &Path) -> Result<Contents> {
         return Ok(Contents::Run);
     }
     match std::fs::read_dir(folder) {
-        // What a program that was killed was about to write is nothing.
+        // Temporary files of a killed program do not count.
         Ok(mut entries) => Ok(match entries.any(|entry| !entry.is_ok_and(|entry| is_nothing(&entry))) {
             true => Contents::Other,
             false => Contents::Nothing,
@@ -337,7 +340,7 @@ mod tests {
     use raygrad::nerf::{GroupConfig, LossTermConfig, Preset};
 
     #[test]
-    fn runs_of_later_versions_are_told_apart() {
+    fn open_later_version_names_it() {
         let later = |text: &str| later_version(text);
         assert_eq!(later(r#"{"raygrad":"999.0.1","new":[]}"#).as_deref(), Some("999.0.1"));
         assert_eq!(later(r#"{"raygrad":"0.999.0-rc1"}"#).as_deref(), Some("0.999.0-rc1"));
@@ -362,7 +365,7 @@ mod tests {
         ("eps", "epsilon"),
     ];
 
-    /// The JSON value with keys and words as earlier versions wrote them; `found` counts each.
+    /// The JSON value with the keys and words of earlier versions. `found` counts each of them.
     fn aged(value: Value, found: &mut [usize]) -> Value {
         let mut old = |text: &str| match OLD_KEYS.iter().position(|(new, _)| *new == text) {
             Some(i) => {
@@ -384,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn config_with_earlier_keys_is_read() {
+    fn open_config_with_old_keys_succeeds() {
         let viewpoint =
             Viewpoint { width: 8, height: 6, angle_x: 0.7, distance: 4.0, elevation: 0.5, azimuth: 0.0, reach: 1.0 };
         let mut found = [0; OLD_KEYS.len()];

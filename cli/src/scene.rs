@@ -1,4 +1,4 @@
-//! Where photographs come from.
+//! Sources of images.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -17,7 +17,7 @@ pub const EMBEDDED_SIZE: usize = 200;
 /// Width and height of the landscape's images in pixels.
 pub const LANDSCAPE_SIZE: [usize; 2] = [400, 300];
 
-/// A folder of photographs, or a scene that needs none.
+/// A folder of images, or a built-in scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Scene {
@@ -30,7 +30,8 @@ pub enum Scene {
 }
 
 impl From<OsString> for Scene {
-    /// `embedded` and `landscape` are the built-in scenes (a folder of that name is `./embedded`), anything else a folder.
+    /// `embedded` and `landscape` are the built-in scenes (a folder of that name is `./embedded`). All else is a
+    /// folder.
     fn from(text: OsString) -> Self {
         match text.to_str() {
             Some("embedded") => Scene::Embedded,
@@ -51,7 +52,7 @@ impl fmt::Display for Scene {
 }
 
 impl Scene {
-    /// What the scene's files say, and where it lies; `asked` overrules how far it goes.
+    /// Reads the scene's files and analyses the scene. `asked` overrides the scene type.
     pub fn open(&self, asked: Option<SceneType>) -> Result<Opened> {
         let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, asked)) };
         let capture = Capture::read(folder)?;
@@ -59,7 +60,7 @@ impl Scene {
         Ok(Opened::new(self, Some((capture, survey)), asked))
     }
 
-    /// The same, lying where a model has it, which may go on beyond its box.
+    /// Like [`open`](Self::open), with the scene transform of a model. `goes_on` is true for an unbounded scene.
     pub fn open_for(&self, extent: &SceneBox, goes_on: bool) -> Result<Opened> {
         let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, None)) };
         let SceneBox { transform: placement, bounds, near_far: [near, far], ndc, .. } = *extent;
@@ -73,7 +74,7 @@ impl Scene {
         Ok(Opened::new(self, Some((Capture::read(folder)?, survey)), None))
     }
 
-    /// The same scene, found from any working directory.
+    /// The same scene with an absolute path.
     pub fn absolute(&self) -> Result<Scene> {
         match self {
             Scene::Embedded | Scene::Landscape => Ok(self.clone()),
@@ -82,14 +83,14 @@ impl Scene {
     }
 }
 
-/// A scene whose files have been read, but for the photographs.
+/// A scene whose files are read, except for the images.
 pub struct Opened {
-    /// Whether depths that were measured are read with the photographs.
+    /// True to load measured depths with the images.
     pub depth: bool,
     scene: Scene,
-    /// What a folder holds.
+    /// Capture and analysis of a folder.
     pub capture: Option<(Capture, SceneAnalysis)>,
-    /// How far the scene is to go, if that was asked for.
+    /// Requested scene type.
     asked: Option<SceneType>,
 }
 
@@ -98,7 +99,7 @@ impl Opened {
         Opened { depth: false, scene: scene.clone(), capture, asked }
     }
 
-    /// At most `views` evenly spaced photographs of a split, at `1 / downscale` of their size. Warns of absent images.
+    /// Loads at most `views` evenly spaced images of a split at `1 / downscale` of their size. Warns of absent images.
     pub fn load(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
         let data = match &self.capture {
             None => {
@@ -137,7 +138,7 @@ impl Opened {
     }
 }
 
-/// Whether images of this size can be made smaller by that factor.
+/// Fails if images of this size cannot be downscaled by the factor.
 fn divides(downscale: usize, [width, height]: [usize; 2]) -> Result<()> {
     if width.is_multiple_of(downscale) && height.is_multiple_of(downscale) {
         return Ok(());

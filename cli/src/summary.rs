@@ -1,4 +1,4 @@
-//! What came of a run, for whoever looks at it later: `summary.json`.
+//! Summary of a run for later analysis: `summary.json`.
 
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -9,48 +9,47 @@ use serde::{Deserialize, Serialize};
 use super::machine;
 use super::run::{Run, write_json};
 
-/// The name of the file in a run's folder.
+/// File name in a run's folder.
 const FILE: &str = "summary.json";
-/// Steps whose loss and PSNR are averaged: those of single steps jump.
+/// Number of last steps whose loss and PSNR are averaged, since single steps fluctuate.
 const AVERAGED: usize = 100;
 
-/// How a run has ended.
+/// How a run ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Ended {
-    /// By using up its budget.
+    /// It used up its budget.
     Done,
-    /// By Ctrl-C or SIGTERM.
+    /// Ctrl-C or SIGTERM stopped it.
     Interrupted,
-    /// Because its numbers were no longer finite.
+    /// Its numbers were no longer finite.
     Diverged,
 }
 
 /// The last preview.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Previewed {
-    /// The photograph that was compared with.
+    /// Name of the image.
     pub name: String,
-    /// Whether it is not trained on.
+    /// True for a held-out image.
     pub held_out: bool,
-    /// Steps that the model had been trained for.
+    /// Training step of the preview.
     pub step: u64,
-    /// In dB; null if it is not finite.
+    /// PSNR in dB; null if it is not finite.
     pub psnr: Option<f64>,
 }
 
-/// What adds up over the parts of a run that was ended and gone on with. The first fields of [`Summary`] are these.
+/// Sums over the sessions of a resumed run. They are the first fields of [`Summary`].
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct Sums {
-    /// Time in which a program trained the run, with previews and files, in seconds. Of a part that was killed, up to its last
-    /// checkpoint.
+    /// Wall time of training in seconds, with previews and files. A killed session counts up to its last checkpoint.
     wall_seconds: f64,
-    /// How often it was gone on with.
+    /// Number of times that the run resumed.
     resumed: u32,
-    /// How often it went back to a checkpoint because it had diverged.
+    /// Number of times that the run diverged and returned to a checkpoint.
     #[serde(default)]
     retreats: u32,
-    /// The most memory that any part took, where the system says so.
+    /// Peak memory of any session, if the system reports it.
     peak_memory_bytes: Option<u64>,
     preview: Option<Previewed>,
 }
@@ -59,7 +58,7 @@ struct Sums {
 #[derive(Serialize)]
 struct Summary<'a> {
     raygrad: &'static str,
-    /// Null while it is trained, and of a run that was killed.
+    /// Null during training, and for a killed run.
     ended: Option<Ended>,
     seed: u64,
     budget: Budget,
@@ -68,21 +67,20 @@ struct Summary<'a> {
     train_seconds: f64,
     #[serde(flatten)]
     sums: &'a Sums,
-    /// Means of the last steps, of which there are so many.
+    /// Number of averaged steps.
     averaged_steps: usize,
     loss: Option<f64>,
-    /// On the rays that were trained on, in dB.
+    /// PSNR on the training rays, in dB.
     psnr: Option<f64>,
-    /// Samples placed on rays, evaluations of densities and of colours, and those of each that there would have been if
-    /// nothing in the box were skipped.
+    /// Placed samples, density queries and colour queries, and the number of each without skipping within the box.
     placed_samples: u64,
     density_queries: u64,
     color_queries: u64,
     unskipped: u64,
-    /// What was left out of these: 0 to 1, of the last.
+    /// The last fractions of skipped samples and queries: 0 to 1.
     skipped_share: Option<Shares>,
     restarts: u32,
-    /// Elements whose gradient was not finite.
+    /// Number of gradient elements that were not finite.
     non_finite_gradients: u64,
     threads: usize,
     processor: String,
@@ -95,9 +93,9 @@ struct Shares {
     color_queries: f64,
 }
 
-/// Keeps account of a run while it is trained.
+/// Collects the summary of a run during training.
 pub struct Account {
-    /// Of the parts before this one.
+    /// Sums of earlier sessions.
     past: Sums,
     start: Instant,
     /// Loss and PSNR of the last steps.
@@ -106,7 +104,7 @@ pub struct Account {
 }
 
 impl Account {
-    /// The account of a run that has come to this step. A file that is absent or damaged says nothing of earlier parts.
+    /// Opens the summary of a run at this step. An absent or damaged file counts as no earlier session.
     pub fn open(run: &Run, stats: &StepStats) -> Self {
         let text = std::fs::read(run.file(FILE)).ok();
         let past = text.and_then(|text| serde_json::from_slice::<Sums>(&text).ok());
@@ -116,13 +114,13 @@ impl Account {
             Some(past) => Sums { resumed: past.resumed.saturating_add(1), ..past },
             None => Sums { resumed: u32::from(begun), ..Sums::default() },
         };
-        // A later one was of steps that are taken again.
+        // The steps of a later preview are taken again.
         let preview = past.preview.take().filter(|preview| preview.step <= stats.step);
         let recent = begun.then_some([stats.loss, stats.psnr]).into_iter().collect();
         Account { past, start: Instant::now(), recent, preview }
     }
 
-    /// A step was taken.
+    /// Records a training step.
     pub fn step(&mut self, stats: &StepStats) {
         self.recent.push_back([stats.loss, stats.psnr]);
         if self.recent.len() > AVERAGED {
@@ -130,18 +128,18 @@ impl Account {
         }
     }
 
-    /// It goes on from a checkpoint, having diverged.
+    /// Records a return to a checkpoint after divergence.
     pub fn retreat(&mut self) {
         self.past.retreats += 1;
     }
 
-    /// It is back at this step.
+    /// Discards data of steps after this one.
     pub fn cut(&mut self, step: u64) {
         self.recent.clear();
         self.preview = self.preview.take().filter(|preview| preview.step <= step);
     }
 
-    /// A preview was made.
+    /// Records a preview.
     pub fn preview(&mut self, preview: Previewed) {
         self.preview = Some(preview);
     }
@@ -185,7 +183,7 @@ impl Account {
     }
 }
 
-/// How much of what there is to do was left out.
+/// Fractions of skipped samples and queries.
 fn shares(stats: &StepStats) -> Option<Shares> {
     let share = |count: u64| 1.0 - count as f64 / stats.unskipped as f64;
     let StepStats { placed_samples, density_queries, color_queries, unskipped, .. } = *stats;
@@ -203,7 +201,7 @@ mod tests {
     use serde_json::{Value, json};
 
     #[test]
-    fn parts_of_a_run_add_up() {
+    fn summary_of_resumed_run_adds_up() {
         let folder = tempfile::tempdir().unwrap();
         let run = Run { folder: folder.path().into(), config: run_config() };
         let read = || serde_json::from_slice::<Value>(&std::fs::read(run.file(FILE)).unwrap()).unwrap();
@@ -212,14 +210,14 @@ mod tests {
             read()
         };
         let at = |step: u64| StepStats { step, loss: step as f64, psnr: -2.0 * step as f64, ..StepStats::default() };
-        // Nothing was done yet.
+        // Before the first step.
         let account = Account::open(&run, &at(0));
         let begun = write(&account, &at(0), None);
         for name in ["ended", "loss", "psnr", "preview", "skipped_share"] {
             assert_eq!(begun[name], Value::Null, "{name}");
         }
         assert_eq!([&begun["resumed"], &begun["averaged_steps"]], [&json!(0), &json!(0)]);
-        // The means are those of the last hundred steps.
+        // The means cover the last hundred steps.
         let mut account = Account::open(&run, &at(0));
         account.past.wall_seconds = 1000.0;
         account.past.peak_memory_bytes = Some(1 << 60);
@@ -246,7 +244,7 @@ mod tests {
             json!({ "placed_samples": 0.75, "density_queries": 0.8, "color_queries": 0.95 })
         );
         assert_eq!([&ended["non_finite_gradients"], &ended["restarts"]], [&json!(3), &json!(2)]);
-        // It diverges, and goes back to where there was no such preview.
+        // After divergence, the run returns to a step before the preview.
         account.retreat();
         account.cut(139);
         let back = write(&account, &at(139), None);
@@ -259,14 +257,14 @@ mod tests {
         account.preview(preview.clone());
         account.past.retreats = 0;
         write(&account, &counts, Some(Ended::Interrupted));
-        // It goes on: from a step before the preview, and from one after it.
+        // The run resumes from a step before the preview, and from one at it.
         for (step, shown) in [(139, None), (140, Some(preview))] {
             let later = Account::open(&run, &at(step));
             assert_eq!((later.past.resumed, later.past.peak_memory_bytes), (2, Some(1 << 60)));
             assert!((1000.0..1060.0).contains(&later.past.wall_seconds), "{:?}", later.past);
             assert_eq!((&later.preview, &later.recent), (&shown, &VecDeque::from([[step as f64, -2.0 * step as f64]])));
         }
-        // What is damaged says nothing, and is no error.
+        // A damaged file is ignored, without an error.
         for text in ["", "{}", "[[[", r#"{"wall_seconds":-1,"resumed":3,"peak_memory_bytes":null,"preview":null}"#] {
             std::fs::write(run.file(FILE), text).unwrap();
             let past = Account::open(&run, &at(9)).past;

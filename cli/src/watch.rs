@@ -1,4 +1,4 @@
-//! What happens beside training: progress, metrics, previews, and saving the model.
+//! Output during training: progress, metrics, previews, and saved models.
 
 use std::collections::HashSet;
 use std::io::ErrorKind;
@@ -20,29 +20,30 @@ use serde_json::Value;
 
 /// Steps between lines of `metrics.jsonl`.
 const METRICS_STEPS: u64 = 10;
-/// Training time of the first preview in seconds; each further one comes at twice the time of the one before.
+/// Training time of the first preview in seconds. The interval doubles: each further preview comes at twice the time of
+/// the last one.
 const FIRST_PREVIEW: f64 = 5.0;
-/// Weight of the latest step in the PSNR that is shown: that of single steps jumps.
+/// Weight of the latest step in the displayed PSNR, since single steps fluctuate.
 const SMOOTHING: f64 = 0.05;
 
-/// What the learning rate of a run is multiplied by that has diverged and goes back.
+/// Factor of the learning rate when a diverged run returns to a checkpoint.
 const SLOWER: f64 = 0.25;
 
 /// An observer of one training run.
 pub struct Watch<'a> {
     run: &'a Run,
     lock: Lock,
-    /// Whether another program has the run's folder, or one in its place: nothing is written any more.
+    /// True if another program owns the run's folder or its path. Nothing is written then.
     lost: bool,
     budget: Budget,
     preview: Preview,
     metrics: Journal,
-    /// What TensorBoard is told, if it is.
+    /// Event file of TensorBoard, if enabled.
     events: Option<Events>,
     account: Account,
-    /// The last step in the metrics.
+    /// Last step in the metrics.
     logged: u64,
-    /// The step that it went back to last, having diverged.
+    /// Last step to which a diverged run returned.
     back: Option<u64>,
     next_preview: f64,
     /// Training time between saves in seconds.
@@ -50,13 +51,13 @@ pub struct Watch<'a> {
     next_save: f64,
     psnr: Option<f64>,
     progress: Progress,
-    /// The words about files that could not be written.
+    /// Warnings about files that were printed already.
     warned: HashSet<String>,
 }
 
 impl<'a> Watch<'a> {
-    /// Begins to watch; the untrained model is saved and a checkpoint, so that the folder is a whole run from the start. What
-    /// metrics say of steps that are to come is cut off. `tensorboard` asks for event files too; a run that has some gets more.
+    /// Starts watching. Saves the model and a checkpoint, so that the folder is a complete run from the start. Cuts
+    /// metrics of later steps. `tensorboard` enables event files, which a run with earlier ones always continues.
     pub fn new(
         (run, mut lock): (&'a Run, Lock),
         trainer: &Trainer,
@@ -102,13 +103,13 @@ impl<'a> Watch<'a> {
         Ok(watch)
     }
 
-    /// Whether another program has taken the run's folder, or one in its place: training is to stop.
+    /// Returns true if another program owns the run's folder or its path. Training must stop.
     pub fn has_lost_its_run(&self) -> bool {
         self.lost
     }
 
-    /// Asked before each write: whether the run's folder is still this program's. One that was removed or moved is made again,
-    /// which is said, and the metrics begin anew in it.
+    /// Checks before each write that this program still owns the run's folder. If the folder was removed or moved, it
+    /// is created again with a warning, and the metrics start anew.
     fn keep(&mut self) -> Result<()> {
         let kept = self.run.keep(&mut self.lock);
         self.lost |= kept.is_err() && self.lock.state() == State::Lost;
@@ -124,7 +125,7 @@ impl<'a> Watch<'a> {
         Ok(())
     }
 
-    /// Begins an event file for the steps after this one.
+    /// Creates an event file for the steps after this one.
     fn begin_events(&mut self, step: u64) {
         self.events = None;
         self.attempt(|watch| {
@@ -133,8 +134,8 @@ impl<'a> Watch<'a> {
         });
     }
 
-    /// Called after each step; `stops` says that it is the last one, whatever the budget. What cannot be written is said, and
-    /// training goes on: a full disk may have room again in a minute.
+    /// Called after each step. `stops` marks the last step, whatever the budget. Failed writes give a warning, and
+    /// training continues: a full disk may have space later.
     pub fn step(&mut self, trainer: &Trainer, stops: bool) {
         let stats = trainer.stats();
         let before = self.psnr.filter(|psnr| psnr.is_finite());
@@ -154,8 +155,8 @@ impl<'a> Watch<'a> {
             self.next_preview = 2.0 * stats.train_seconds.max(self.next_preview);
             self.attempt(|watch| watch.preview(trainer));
         }
-        // Views look at a finished model, and training goes on from one that is not; and not from one that may have diverged,
-        // unless there is no later one to come.
+        // The model is saved at a good step, for viewers. A checkpoint that may have diverged is saved only at the end,
+        // if no later one can follow.
         let ends = stops || fraction >= 1.0;
         let good = stats.non_finite_steps == 0 || (ends && !stats.ends_diverged());
         if (ends || stats.train_seconds >= self.next_save) && good {
@@ -164,7 +165,7 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// Writes a checkpoint and the summary, and the model before them if it is to be.
+    /// Writes a checkpoint and the summary. With `model`, writes the model before them.
     fn save(&mut self, trainer: &Trainer, model: bool) -> Result<()> {
         self.keep()?;
         if model {
@@ -176,11 +177,11 @@ impl<'a> Watch<'a> {
         self.summarise(&trainer.stats(), None)
     }
 
-    /// Takes a trainer that has diverged, for that `reason`, back to a checkpoint, from where it goes on with lower learning
-    /// rates, and says so. If that cannot be, it says why and gives `false`.
+    /// Returns a trainer that has diverged to a checkpoint and prints the `reason`. Training continues with lower
+    /// learning rates. If this fails, prints the cause and returns false.
     pub fn retreat(&mut self, trainer: &mut Trainer, reason: &str) -> bool {
         let (end, pace) = (trainer.stats().step, trainer.lr_scale());
-        // What was good when it was written may have been on its way out of all bounds: the second time it is the one before.
+        // A checkpoint may be good but about to diverge. So the second return uses the one before it.
         let back = self.keep().and_then(|()| checkpoint::step_back(self.run, self.back)).and_then(|()| {
             checkpoint::load(self.run, trainer)?;
             trainer.set_lr_scale(SLOWER * pace);
@@ -200,14 +201,14 @@ impl<'a> Watch<'a> {
         back.is_ok()
     }
 
-    /// Takes a trainer that has diverged for good back to the last checkpoint; says whether there is one.
+    /// Returns a trainer that has diverged finally to its last checkpoint. Returns false if there is none.
     pub fn give_up(&mut self, trainer: &mut Trainer) -> bool {
         let back = checkpoint::load(self.run, trainer).and_then(|()| self.keep()).and_then(|()| self.cut(trainer));
         trainer.model.finish();
         self.attempt(|_| back)
     }
 
-    /// Forgets what was written of steps after the one that a trainer is at.
+    /// Discards output of steps after the trainer's step.
     fn cut(&mut self, trainer: &Trainer) -> Result<()> {
         let StepStats { step, train_seconds, .. } = trainer.stats();
         (self.metrics, self.logged) = metrics(self.run, step)?;
@@ -220,8 +221,8 @@ impl<'a> Watch<'a> {
         Ok(())
     }
 
-    /// Does what training goes on without: says what went wrong, if it was not said before, and gives whether nothing did. That the
-    /// run is lost ends training, and is said then.
+    /// Runs work that training can do without. Prints an error once and returns true on success. Loss of the run's
+    /// folder ends training, and is reported then.
     fn attempt(&mut self, work: impl FnOnce(&mut Self) -> Result<()>) -> bool {
         let Err(error) = work(self) else { return true };
         let words = format!("raygrad: warning: {error}; training continues");
@@ -231,11 +232,12 @@ impl<'a> Watch<'a> {
         false
     }
 
-    /// Called when training has ended; unless somebody waits for that, there is a last preview. The model is written if it is
-    /// `good`, so that none that is not takes the place of one that is.
+    /// Called at the end of training. Renders a last preview, unless the user has interrupted the run. Writes the model
+    /// if it is `good`, so that a diverged model never replaces a good one.
     ///
     /// # Errors
-    /// If the run is lost, or something cannot be written.
+    ///
+    /// Fails if the run's folder is lost or a file cannot be written.
     pub fn finish(mut self, trainer: &Trainer, ended: Ended, good: bool) -> Result<()> {
         self.keep()?;
         if good {
@@ -282,7 +284,7 @@ impl<'a> Watch<'a> {
         Ok(())
     }
 
-    /// Tells TensorBoard something, if it is told anything; what it cannot be told is said, and no more.
+    /// Writes to the event file, if enabled. Failure gives a warning.
     fn tell(&mut self, write: impl FnOnce(&mut Events) -> Result<()>) {
         self.attempt(|watch| watch.events.as_mut().map_or(Ok(()), write));
     }
@@ -291,14 +293,14 @@ impl<'a> Watch<'a> {
         self.account.write(self.run, stats, self.budget, ended)
     }
 
-    /// The PSNR that is shown, and the seconds of training that are left.
+    /// The displayed PSNR, and the remaining training time in seconds.
     pub fn shown(&self, trainer: &Trainer) -> (f64, f64) {
         let stats = trainer.stats();
         (self.psnr.unwrap_or(stats.psnr), remaining(self.budget, &stats).1)
     }
 }
 
-/// Share of a run that is done, and the seconds of training that are left.
+/// Completed fraction of a run, and the remaining training time in seconds.
 pub fn remaining(budget: Budget, stats: &StepStats) -> (f64, f64) {
     match budget {
         Budget::Time(time) => {
@@ -312,26 +314,26 @@ pub fn remaining(budget: Budget, stats: &StepStats) -> (f64, f64) {
     }
 }
 
-/// Why the numbers of a trainer are not finite, as the end of a sentence.
+/// The reason why a trainer's numbers are not finite, as the end of a sentence.
 pub fn reason(trainer: &Trainer) -> String {
     trainer.first_non_finite(1.0).map_or(String::new(), |error| format!(" ({error})"))
 }
 
-/// Training time in seconds at which a preview comes next.
+/// Training time of the next preview in seconds.
 fn next_preview(train_seconds: f64) -> f64 {
     let mut previews = std::iter::successors(Some(FIRST_PREVIEW), |time| Some(2.0 * time));
     previews.find(|time| *time > train_seconds).unwrap_or(f64::INFINITY)
 }
 
-/// The metrics of a run, cut to a step, and the last step in them.
+/// The metrics of a run, cut to a step, and their last step.
 fn metrics(run: &Run, step: u64) -> Result<(Journal, u64)> {
     let path = run.file("metrics.jsonl");
     let (kept, logged) = kept_metrics(&path, step)?;
     Ok((Journal::begin(&path, kept.as_bytes())?, logged))
 }
 
-/// The lines of metrics in a file of steps up to this one, and the last of these steps; none if there is no file. What was
-/// written because a run ended there is left out, as a run that was not ended has no such line; and a line that is not whole.
+/// The lines of a metrics file up to this step, and their last step; empty without a file. Omits lines that were
+/// written only because the run ended there, and incomplete lines.
 fn kept_metrics(path: &Path, step: u64) -> Result<(String, u64)> {
     let text = match std::fs::read(path) {
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok((String::new(), 0)),
@@ -350,16 +352,16 @@ fn kept_metrics(path: &Path, step: u64) -> Result<(String, u64)> {
     Ok((kept, last))
 }
 
-/// What metrics say as numbers by their names, and how fast training is.
+/// Named scalars of the metrics, and the training speed.
 fn scalars(values: &Value, stats: &StepStats) -> Vec<(String, f64)> {
     let named = values.as_object().into_iter().flatten().filter(|(name, _)| *name != "step");
-    // What is not finite is null in a line of metrics.
+    // Values that are not finite are null in the metrics.
     let named = named.map(|(name, value)| (format!("train/{name}"), value.as_f64().unwrap_or(f64::NAN)));
     let speed = ("train/rays_per_second".to_owned(), stats.rays as f64 / stats.train_seconds);
     named.chain([speed]).collect()
 }
 
-/// Whether metrics have a line of a step that is not the last one.
+/// Returns true if metrics have a line of a step that is not the last one.
 fn is_logged(step: u64) -> bool {
     step == 1 || step.is_multiple_of(METRICS_STEPS)
 }
@@ -369,13 +371,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn metrics_are_cut_to_where_a_run_goes_on() {
+    fn kept_metrics_end_at_the_resumed_step() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
         assert_eq!(kept_metrics(&path, 9).unwrap(), (String::new(), 0));
         let line = |step: u64| format!("{{\"step\":{step},\"loss\":0.5}}\n");
         let lines = |steps: &[u64]| steps.iter().map(|step| line(*step)).collect::<String>();
-        // It was ended at 14, went on, and was killed while it wrote of 40.
+        // The run ended at 14, resumed, and was killed while it wrote line 40.
         std::fs::write(&path, lines(&[1, 10, 14, 20, 30]) + "{\"step\":40,\"lo").unwrap();
         for (step, expected) in
             [(0, vec![]), (9, vec![1]), (19, vec![1, 10]), (20, vec![1, 10, 20]), (99, vec![1, 10, 20, 30])]
@@ -385,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_follows_from_what_was_done() {
+    fn remaining_time_follows_from_progress() {
         let stats = StepStats { step: 40, train_seconds: 8.0, ..StepStats::default() };
         assert_eq!(remaining(Budget::Steps(200), &stats), (0.2, 32.0));
         assert_eq!(remaining(Budget::Steps(20), &stats), (2.0, 0.0));
@@ -394,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn previews_come_at_twice_the_time_of_the_one_before() {
+    fn next_preview_doubles_the_time() {
         assert_eq!([0.0, 4.9, 5.0, 39.0, 40.0].map(next_preview), [5.0, 5.0, 10.0, 40.0, 80.0]);
     }
 }

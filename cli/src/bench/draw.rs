@@ -1,4 +1,4 @@
-//! Figures as SVG and PNG. The letters of the PNG come from a font in the program: nothing is asked of the system.
+//! Figures as SVG and PNG. An embedded font draws the text of the PNG, so that no system font is needed.
 
 use std::path::Path;
 use std::sync::Once;
@@ -11,11 +11,11 @@ use raygrad::nerf::{Error, Image, Result, write_atomic};
 
 use super::figure::{Axis, Figure, Panel, Series};
 
-/// DejaVu Sans, cut down to the letters that are needed; its licence is beside it.
+/// DejaVu Sans, reduced to ASCII. Its licence is in the same folder.
 static FONT: &[u8] = include_bytes!("font/DejaVuSans-ascii.ttf");
 static REGISTERED: Once = Once::new();
 
-/// Colours that colour-blind people tell apart (Okabe and Ito 2008), the dark ones first.
+/// The palette of Okabe and Ito (2008), which is safe for colour blindness. Dark colours come first.
 const COLORS: [RGBColor; 8] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -30,21 +30,21 @@ const GRID: RGBColor = RGBColor(225, 225, 225);
 const FRAME: RGBColor = RGBColor(90, 90, 90);
 /// Space around a diagram, in pixels: left, right, above, below.
 const MARGINS: [i32; 4] = [62, 14, 44, 44];
-/// The width of a letter of the legend, about.
+/// Approximate width of a legend character, in pixels.
 const LETTER: i32 = 8;
 
 type Area<B> = DrawingArea<B, Shift>;
 type Drawn<B> = std::result::Result<(), DrawingAreaErrorKind<<B as DrawingBackend>::ErrorType>>;
 
-/// Makes the letters of this program known to plotters, as `sans-serif`.
+/// Registers the embedded font with plotters as `sans-serif`.
 fn register_letters() {
     REGISTERED.call_once(|| {
-        // A font that is part of the program can be read, as every run shows.
+        // The embedded font is valid: each figure uses it.
         let _ = register_font("sans-serif", FontStyle::Normal, FONT);
     });
 }
 
-/// Writes `NAME.svg` and `NAME.png` into a folder; returns the text of the SVG.
+/// Writes `NAME.svg` and `NAME.png` into a folder and returns the text of the SVG.
 pub fn save(figure: &Figure, folder: &Path) -> Result<String> {
     register_letters();
     let size = size(figure);
@@ -59,7 +59,7 @@ pub fn save(figure: &Figure, folder: &Path) -> Result<String> {
     Ok(svg)
 }
 
-/// The image of that width and height that `draw` draws, RGB.
+/// Returns the RGB image of this width and height that `draw` draws.
 pub fn bitmap<E>(
     size: (u32, u32),
     draw: impl FnOnce(&Area<BitMapBackend<'_>>) -> std::result::Result<(), E>,
@@ -84,7 +84,7 @@ fn head(figure: &Figure, width: u32) -> u32 {
     34 + 20 * legend(figure, width as i32).last().map_or(0, |entry| entry.1 as u32 + 1)
 }
 
-/// The kinds of points, each once: its series, and the row and the left end of its entry.
+/// Legend entries without duplicates: series, row and left end.
 fn legend(figure: &Figure, width: i32) -> Vec<(&Series, i32, i32)> {
     let mut out: Vec<(&Series, i32, i32)> = vec![];
     let (mut row, mut left) = (0, 16);
@@ -130,11 +130,11 @@ fn write<B: DrawingBackend>(area: &Area<B>, text: &str, [x, y]: [i32; 2], size: 
     area.draw(&Text::new(text, (x, y), style))
 }
 
-/// The mark of a kind of points: a disc, a square, a triangle or a diamond.
+/// Draws a marker: a disc, a square, a triangle or a diamond.
 fn mark<B: DrawingBackend>(area: &Area<B>, series: &Series, [x, y]: [i32; 2]) -> Drawn<B> {
     let style = color(series.style);
     let style = if series.hollow { style.stroke_width(1) } else { style.filled() };
-    // Styles that share a colour have different shapes.
+    // Styles with the same colour have different markers.
     let corners: &[[i32; 2]] = match (series.style + series.style / 4) % 4 {
         0 => return area.draw(&Circle::new((x, y), 4, style)),
         1 => &[[-4, -4], [4, -4], [4, 4], [-4, 4]],
@@ -149,7 +149,7 @@ fn mark<B: DrawingBackend>(area: &Area<B>, series: &Series, [x, y]: [i32; 2]) ->
     area.draw(&Polygon::new(corners, style))
 }
 
-/// The values that an axis shows, as places on it.
+/// The range and the ticks of an axis, in axis coordinates.
 struct Scale {
     low: f64,
     high: f64,
@@ -167,7 +167,7 @@ impl Scale {
         Scale { low, high, ticks }
     }
 
-    /// The pixel of a place between two.
+    /// The pixel of an axis coordinate, between `from` and `to`.
     fn pixel(&self, place: f64, [from, to]: [i32; 2]) -> i32 {
         from + ((place - self.low) / (self.high - self.low) * f64::from(to - from)).round() as i32
     }
@@ -194,7 +194,7 @@ fn linear_ticks(low: f64, high: f64) -> Vec<(f64, String)> {
     ticks.map(|place| (place, format!("{place:.digits$}"))).collect()
 }
 
-/// A number in few letters.
+/// A number as a short text.
 fn number(value: f64) -> String {
     if (0.01..1e5).contains(&value) { format!("{}", (value * 1e6).round() / 1e6) } else { format!("{value:.0e}") }
 }
@@ -243,7 +243,7 @@ fn draw_panel<B: DrawingBackend>(panel: &Panel, area: &Area<B>) -> Drawn<B> {
             let is_right = px + 8 + wide > x_range[1];
             let (at, side, left) =
                 if is_right { (px - 8, HPos::Right, px - 8 - wide) } else { (px + 8, HPos::Left, px + 8) };
-            // Beside the point, or further up or down where there is another label.
+            // Beside the point, or above or below if another label is there.
             let is_free = |y: &i32| {
                 taken.iter().all(|[l, r, top, bottom]| left > *r || left + wide < *l || y - 6 > *bottom || y + 6 < *top)
             };
@@ -260,7 +260,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ticks_are_round_numbers() {
+    fn ticks_log_and_linear_are_round() {
         let labels = |ticks: Vec<(f64, String)>| ticks.into_iter().map(|tick| tick.1).collect::<Vec<_>>();
         assert_eq!(labels(linear_ticks(-0.1, 1.05)), ["0.0", "0.5", "1.0"]);
         assert_eq!(labels(linear_ticks(31.0, 47.0)), ["35", "40", "45"]);
@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn figure_draws_its_own_font() {
+    fn font_embedded_is_drawn() {
         let axis = || Axis::log("evaluations");
         let points = vec![[8.0, 1e-2], [64.0, 1e-4], [128.0, 0.0]];
         let series = vec![

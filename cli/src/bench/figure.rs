@@ -1,86 +1,86 @@
-//! What a figure shows.
+//! Data of a figure.
 
-/// A direction of a panel.
+/// An axis of a panel.
 #[derive(Debug, Clone)]
 pub struct Axis {
-    /// What is shown, with its unit.
+    /// Label with the unit.
     pub label: String,
-    /// Whether decades are equally far apart.
+    /// True for a logarithmic scale.
     pub log: bool,
 }
 
 impl Axis {
-    /// Equal steps are equally far apart.
+    /// A linear scale.
     pub fn linear(label: &str) -> Self {
         Axis { label: label.to_owned(), log: false }
     }
 
-    /// Equal factors are equally far apart; what is not more than 0 is not shown.
+    /// A logarithmic scale. It omits values that are not positive.
     pub fn log(label: &str) -> Self {
         Axis { label: label.to_owned(), log: true }
     }
 
-    /// Where a value lies; equal distances of this are equal distances on paper.
+    /// The axis coordinate of a value: the value itself, or its logarithm.
     pub fn place(&self, value: f64) -> f64 {
         if self.log { value.log10() } else { value }
     }
 }
 
-/// Points of one kind.
+/// Points with one style.
 #[derive(Debug, Clone)]
 pub struct Series {
-    /// As the legend has it; the same name in several panels is the same kind.
+    /// Name in the legend. Series of the same name share one entry.
     pub name: String,
-    /// Number of the colour and of the shape of its marks.
+    /// Index of the colour and of the marker.
     pub style: usize,
-    /// Whether a line joins the points.
+    /// True to join the points by a line.
     pub line: bool,
-    /// Whether marks are hollow: for what is no choice.
+    /// True for hollow markers, which show settings that another one dominates.
     pub hollow: bool,
     /// The points.
     pub points: Vec<[f64; 2]>,
 }
 
 impl Series {
-    /// Marks joined by a line.
+    /// Markers joined by a line.
     pub fn line(name: &str, style: usize, points: Vec<[f64; 2]>) -> Self {
         Series { name: name.to_owned(), style, line: true, hollow: false, points }
     }
 
-    /// Marks alone.
+    /// Markers alone.
     pub fn marks(name: &str, style: usize, points: Vec<[f64; 2]>) -> Self {
         Series { line: false, ..Series::line(name, style, points) }
     }
 }
 
-/// One diagram.
+/// One plot of a figure.
 #[derive(Debug, Clone)]
 pub struct Panel {
-    /// What it is about.
+    /// Title of the panel.
     pub title: String,
-    /// To the right.
+    /// Horizontal axis.
     pub x: Axis,
-    /// Upwards.
+    /// Vertical axis.
     pub y: Axis,
-    /// What it shows.
+    /// Series of the panel.
     pub series: Vec<Series>,
-    /// Words beside points.
+    /// Text beside points.
     pub labels: Vec<([f64; 2], String)>,
 }
 
-/// Diagrams that belong together.
+/// Related panels in one image.
 #[derive(Debug, Clone)]
 pub struct Figure {
-    /// The name of its files.
+    /// File name without extension.
     pub name: String,
-    /// The line above it.
+    /// Title above the panels.
     pub title: String,
-    /// What to see in it.
+    /// Caption on the page.
     pub caption: String,
-    /// Diagrams beside each other.
+    /// Number of panels in a row.
     pub columns: usize,
-    /// Width and height of a diagram in pixels.
+    /// Width and height of a panel in pixels.
     pub panel: [u32; 2],
-    /// The diagrams, row by row.
+    /// The panels, row by row.
     pub panels: Vec<Panel>,
 }

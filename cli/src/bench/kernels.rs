@@ -1,4 +1,4 @@
-//! Kernels: elementary functions, matrix products, the hash grid.
+//! Benchmarks of kernels: elementary functions, matrix products and the hash grid.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -17,9 +17,9 @@ use super::stopwatch::{Timed, compare};
 use super::table::{Table, digits};
 use crate::machine;
 
-/// Elements of a slice: well within the first cache.
+/// Elements of a slice, which fits in the L1 cache.
 const ELEMENTS: usize = 2048;
-/// Values from 220-bit arithmetic, in the repository.
+/// Values from 220-bit arithmetic, relative to the root of the repository.
 const DOUBLE_REFERENCE: &str = "tensor/tests/reference/vmath_f64.bin";
 
 /// Measures all kernels.
@@ -50,7 +50,7 @@ impl Accuracy {
     fn of(errors: impl Iterator<Item = f64>) -> Self {
         let (mut largest, mut sum, mut count) = (0.0_f64, 0.0, 0.0);
         for error in errors {
-            // NaN is an error too.
+            // NaN counts as an error.
             largest = if error <= largest { largest } else { error };
             (sum, count) = (sum + error, count + 1.0);
         }
@@ -58,7 +58,7 @@ impl Accuracy {
     }
 }
 
-/// Over every `step`-th of all f32 numbers.
+/// Accuracy over every `step`-th f32 number.
 fn single_accuracy(function: &Function<f32>, step: u64) -> Accuracy {
     let x: Vec<f32> = (0..(1_u64 << 32).div_ceil(step)).map(|i| f32::from_bits((i * step) as u32)).collect();
     let mut y = vec![0.0; x.len()];
@@ -66,10 +66,10 @@ fn single_accuracy(function: &Function<f32>, step: u64) -> Accuracy {
     Accuracy::of(x.iter().zip(&y).map(|(&x, &y)| ulp_error(y, (function.reference)(x.into()))))
 }
 
-/// On the values of `tensor/tests/reference/vmath_f64.py`; `None` outside of the repository.
+/// Accuracy on the values of `tensor/tests/reference/vmath_f64.py`; `None` outside of the repository.
 fn double_accuracies(functions: &[Function<f64>], reference: &Path) -> Option<Vec<Accuracy>> {
     let bytes = std::fs::read(reference).ok()?;
-    // An argument, the nearest f64 to the value, and the rest in ULP.
+    // An argument, the f64 nearest to the value, and the remainder in ULP.
     let number = |b: &[u8]| f64::from_le_bytes(std::array::from_fn(|i| b[i]));
     let rest = |b: &[u8]| f64::from(f32::from_le_bytes(std::array::from_fn(|i| b[i])));
     let records: Vec<[f64; 3]> = bytes.chunks_exact(20).map(|b| [number(b), number(&b[8..]), rest(&b[16..])]).collect();
@@ -84,7 +84,7 @@ fn double_accuracies(functions: &[Function<f64>], reference: &Path) -> Option<Ve
     Some(functions.iter().zip(records.chunks(count.max(1))).map(accuracy).collect())
 }
 
-/// The time of a function against that of `baseline`, a call on all elements.
+/// Time of a function relative to `baseline`, for one call on all elements.
 fn time<T: Scalar>(function: &Function<T>, baseline: &Function<T>, rounds: usize) -> Timed {
     let arguments = |function: &Function<T>| -> Vec<T> {
         let [low, high] = function.range;
@@ -163,11 +163,11 @@ fn functions(rounds: usize, quick: bool, results: &mut Results) {
     });
 }
 
-/// Eight chains of sixteen fused multiply-adds each, which do not wait for each other.
+/// Eight independent chains of sixteen fused multiply-adds each.
 #[inline(always)]
 fn chains(x: f32, factor: f32) -> f32 {
     let mut sums = [x, x + 1.0, x + 2.0, x + 3.0, x + 4.0, x + 5.0, x + 6.0, x + 7.0];
-    // Written out: a loop in here would keep the loop over elements from being vectorised.
+    // Unrolled by hand: an inner loop would prevent vectorisation over elements.
     macro_rules! round {
         ($($chain:literal)+) => { $(sums[$chain] = sums[$chain].mul_add(factor, x);)+ };
     }
@@ -178,9 +178,9 @@ fn chains(x: f32, factor: f32) -> f32 {
     ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]))
 }
 
-/// Operations a second of nothing but fused multiply-adds in registers, one thread.
+/// Peak FLOP/s of one thread, with fused multiply-adds in registers.
 fn peak(rounds: usize) -> f64 {
-    // With the sums that each chain begins and that all end with.
+    // Includes the additions at the start of each chain and at the end.
     const FLOP: usize = 2 * 8 * 16 + 7 + 7;
     let (x, mut y) = (vec![0.5_f32; ELEMENTS], vec![0.0_f32; ELEMENTS]);
     let factor = black_box(0.999_f32);
@@ -205,7 +205,7 @@ fn seconds(f: &mut impl FnMut()) -> f64 {
     start.elapsed().as_secs_f64()
 }
 
-/// Rows, inner dimension and columns: layers of the small networks, of the classic one, and squares.
+/// Rows, inner dimension and columns of the matrices: layers of small MLPs, of the classic MLP, and squares.
 const SHAPES: [[usize; 3]; 8] = [
     [4096, 16, 64],
     [4096, 32, 64],
@@ -274,7 +274,7 @@ fn products(rounds: usize, results: &mut Results) {
     results.tables.push(table);
 }
 
-/// Samples that are encoded at a time.
+/// Samples per call of the encoding.
 const SAMPLES: usize = 4096;
 
 fn hash_grids(rounds: usize, quick: bool, results: &mut Results) -> Result<()> {
@@ -291,7 +291,7 @@ fn hash_grids(rounds: usize, quick: bool, results: &mut Results) -> Result<()> {
     let mut table = Table::new("hash-grid", &columns);
     let sizes: &[u32] = if quick { &[12, 15, 18] } else { &[10, 12, 13, 14, 15, 16, 17, 18, 19, 20] };
     let random = Tensor::from_fn(&[SAMPLES, 3], |i| unit(i) as f32);
-    // Runs of 64 samples in a row, as rays have them.
+    // Runs of 64 consecutive samples, as along a ray.
     let along = Tensor::from_fn(&[SAMPLES, 3], |i| {
         let (ray, step, axis) = (i / 192, (i / 3 % 64) as f64, i % 3);
         (0.05 + 0.8 * unit(3 * ray + axis) + [0.5, 0.6, 0.62][axis] * step / 512.0) as f32
@@ -345,7 +345,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_function_keeps_its_bound_on_a_coarse_net() {
+    fn accuracy_on_sampled_f32_is_within_bounds() {
         for function in singles() {
             let accuracy = single_accuracy(&function, 1_000_003);
             assert!(accuracy.largest <= function.bound, "{}: {}", function.name, accuracy.largest);

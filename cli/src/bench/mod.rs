@@ -75,23 +75,23 @@ enum Suite {
     All,
 }
 
-/// What a suite found.
+/// Results of a suite.
 #[derive(Debug, Default)]
 pub struct Results {
     /// Tables, in order.
     pub tables: Vec<Table>,
     /// Figures, in order.
     pub figures: Vec<Figure>,
-    /// Sentences that sum it up.
+    /// Summary sentences.
     pub findings: Vec<String>,
 }
 
-/// Measures and writes the files.
+/// Runs the suites and writes the files.
 pub fn run(args: &Args) -> Result<()> {
     let (job, page) = (Job::new("bench", &Value::Null, args.overwrite), args.out.join("report.html"));
     check_folder(&args.out, &page, &job)?;
     make_folder(&args.out)?;
-    // From now on the folder is known as that of a benchmark, also if this one does not get to its end.
+    // An empty page marks the folder as a benchmark, even if this run fails.
     if !job.wrote(&page) {
         report::save(&page, &[], args.quick, job.mark())?;
     }
@@ -124,7 +124,7 @@ pub fn run(args: &Args) -> Result<()> {
     print(&format!("{findings}written: {}; tables and plots are in the same folder\n", page.display()))
 }
 
-/// Whether results may be written to a folder: it is new or empty, or its page is that of an earlier benchmark.
+/// Fails unless the folder is new or empty, or an earlier benchmark wrote its page.
 fn check_folder(folder: &Path, page: &Path, job: &Job) -> Result<()> {
     let is_taken = std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_some());
     if is_taken && !job.overwrites() && !job.wrote(page) {
@@ -134,13 +134,13 @@ fn check_folder(folder: &Path, page: &Path, job: &Job) -> Result<()> {
     Ok(())
 }
 
-/// Runs `f` where no operation is spread over several threads.
+/// Runs `f` on one thread.
 fn on_one_thread<R: Send>(f: impl FnOnce() -> R + Send) -> Result<R> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
     Ok(pool.map_err(|e| Error::setting("threads", e))?.install(f))
 }
 
-/// Writes a suite's tables and figures.
+/// Saves the tables and figures of a suite.
 fn save(title: &str, command: &str, results: Results, folder: &Path) -> Result<report::Section> {
     results.tables.iter().try_for_each(|table| table.save(folder))?;
     let drawn = results.figures.into_iter().map(|figure| Ok((draw::save(&figure, folder)?, figure.caption)));

@@ -1,4 +1,4 @@
-//! Rules for the integral along a ray: error against evaluations and time, on scenes that are known exactly.
+//! Quadrature rules for the integral along a ray: error against evaluations and time, on scenes with exact solutions.
 
 use std::hint::black_box;
 
@@ -17,26 +17,26 @@ use super::table::{Table, digits};
 
 const RULES: [Quadrature; 4] =
     [Quadrature::Left, Quadrature::Midpoint, Quadrature::PiecewiseLinear, Quadrature::Gauss2];
-/// Intervals that the adaptive rule begins with.
+/// Initial intervals of the adaptive rule.
 const FIRST: usize = 32;
-/// Rays that are composited at a time.
+/// Rays per call of compositing.
 const RAYS: usize = 64;
 
-/// Colour, depth and gradient.
+/// Quantities that are compared.
 const QUANTITIES: [&str; 3] = ["colour", "depth", "gradient"];
 
-/// What one rule made of one scene.
+/// Result of one rule on one scene.
 struct Point {
     scene: &'static str,
     rule: String,
     style: usize,
-    /// Evaluations that were asked for, by which times are found.
+    /// Requested evaluations, the key of the times.
     size: usize,
     evaluations: usize,
     errors: [f64; 3],
 }
 
-/// Measures all rules on all scenes.
+/// Benchmarks all rules on all scenes.
 pub fn run(quick: bool) -> Results {
     let sizes: &[usize] = if quick { &[8, 16, 32, 64, 128, 256] } else { &[8, 16, 32, 64, 128, 256, 512, 1024] };
     let scenes = scenes();
@@ -83,16 +83,16 @@ fn points(scenes: &[AnalyticScene], sizes: &[usize], quick: bool) -> Vec<Point> 
     out
 }
 
-/// Errors of colour and depth, and the largest of the gradient of the colour.
+/// Errors of colour and depth, and the largest error of the colour's gradient.
 fn errors_of(scene: &AnalyticScene, seen: &Integral) -> [f64; 3] {
     let exact = &scene.exact;
     let pairs = seen.d_color.iter().zip(&exact.d_color);
-    // NaN wins.
+    // NaN propagates through the maximum.
     let largest = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, Real::maximum);
     [(seen.color - exact.color).abs(), (seen.depth - exact.depth).abs(), largest]
 }
 
-/// Times of compositing, which are the same for every scene: densities and colours are given.
+/// Times of compositing. They are independent of the scene, since densities and colours are inputs.
 struct Cost {
     rule: String,
     size: usize,
@@ -100,7 +100,7 @@ struct Cost {
     both: Timed,
 }
 
-/// Compositing of rays with a rule: densities, colours, and what to do with them.
+/// Inputs of compositing for a rule: densities, colours and the rule itself.
 struct Work {
     rule: Quadrature,
     nodes: Samples<f32>,
@@ -148,7 +148,7 @@ fn times(sizes: &[usize], quick: bool) -> Vec<Cost> {
         for rule in RULES {
             let work = Work::new(scene, rule, size);
             let [tape, other] = [Tape::new(), Tape::new()];
-            // As often as makes a millisecond, more or less.
+            // About a millisecond of repetitions.
             let repeats = (1 << 15) / (size * RAYS).max(1) + 1;
             let forward = |work: &Work, tape: &Tape<f32>| (0..repeats).for_each(|_| work.forward(tape));
             let each = |timed: Timed| Timed { seconds: timed.seconds / repeats as f64, ..timed };
@@ -183,7 +183,7 @@ fn time_table(times: &[Cost]) -> Table {
     table
 }
 
-/// Errors of the colour in 128 evaluations: a row a rule.
+/// Errors of the colour at 128 evaluations, one row per rule.
 fn at_128(scenes: &[AnalyticScene], points: &[Point]) -> Table {
     let columns: Vec<&'static str> = std::iter::once("rule").chain(scenes.iter().map(|scene| scene.name)).collect();
     let mut table = Table::new("quadrature-128", &columns);
@@ -196,7 +196,7 @@ fn at_128(scenes: &[AnalyticScene], points: &[Point]) -> Table {
     table
 }
 
-/// For each rule its points, in the order of evaluations.
+/// Points of each rule, sorted by evaluations.
 fn series(scene: &AnalyticScene, points: &[Point], at: impl Fn(&Point) -> [f64; 2]) -> Vec<Series> {
     let own: Vec<&Point> = points.iter().filter(|point| point.scene == scene.name).collect();
     let mut out: Vec<Series> = vec![];
@@ -220,7 +220,7 @@ fn panels(scenes: &[AnalyticScene], x: &str, y: &str, all: impl Fn(&AnalyticScen
     scenes.iter().map(panel).collect()
 }
 
-/// The least error that is shown.
+/// Smallest error on the axis.
 const FLOOR: f64 = 1e-16;
 
 fn error_figure(scenes: &[AnalyticScene], points: &[Point], which: usize) -> Figure {
@@ -259,7 +259,7 @@ fn time_figure(scenes: &[AnalyticScene], points: &[Point], time_of: &dyn Fn(&Poi
     }
 }
 
-/// The best rule of 128 evaluations on each scene.
+/// The best rule on each scene at 128 evaluations.
 fn findings(points: &[Point]) -> Vec<String> {
     let at: Vec<&Point> = points.iter().filter(|point| point.size == 128).collect();
     let mut out = vec![];
@@ -276,9 +276,9 @@ fn findings(points: &[Point]) -> Vec<String> {
 mod tests {
     use super::*;
 
-    /// Gates on errors and counts, never on times.
+    /// Limits errors and counts. Times are too noisy for limits.
     #[test]
-    fn errors_of_the_quick_suite_are_within_their_gates() {
+    fn errors_quick_suite_are_within_limits() {
         let scenes = scenes();
         let points = points(&scenes, &[64, 128], true);
         assert_eq!(points.len(), scenes.len() * (2 * RULES.len() + 2));

@@ -1,4 +1,4 @@
-//! Settings of the renderer on one trained model: what each costs and what it saves.
+//! Renderer settings on one trained model: cost and savings of each.
 
 mod setting;
 
@@ -22,14 +22,14 @@ use crate::output::note;
 use crate::run::Run;
 use setting::{Setting, WHITE, settings};
 
-/// How many times smaller the steps of the reference are.
+/// The reference divides the default step by this factor.
 const FINER: usize = 8;
-/// Its rule, and another one that it is compared with: what they differ by is what no rule can be judged within.
+/// The rule of the reference, and a second rule. Their difference limits the precision of all comparisons.
 const RULES: [Quadrature; 2] = [Quadrature::Gauss2, Quadrature::Midpoint];
-/// A picture that is the reference to the last bit is shown at this PSNR.
+/// Displayed PSNR of a render that equals the reference exactly.
 const PERFECT: f64 = 140.0;
 
-/// Sizes of the suite.
+/// Parameters of the suite.
 struct Scale {
     steps: u64,
     size: usize,
@@ -37,7 +37,7 @@ struct Scale {
     rounds: usize,
 }
 
-/// What a setting gave.
+/// Result of a setting.
 struct Outcome {
     setting: Setting,
     evaluations: Evaluations,
@@ -48,7 +48,7 @@ struct Outcome {
     dominated: bool,
 }
 
-/// Measures all settings.
+/// Benchmarks all settings.
 pub fn run(quick: bool, folder: Option<&Path>) -> Result<Results> {
     let scale = if quick {
         Scale { steps: 600, size: 64, views: 1, rounds: 2 }
@@ -85,7 +85,7 @@ pub fn run(quick: bool, folder: Option<&Path>) -> Result<Results> {
     })
 }
 
-/// The built-in scene, trained for some steps; its grid is as training left it.
+/// A model of the built-in scene after a few training steps, with the occupancy grid of training.
 fn trained(scale: &Scale) -> Result<(Model<f32>, Dataset)> {
     note(&format!("render: training for {} steps", scale.steps));
     let data = Arc::new(embedded(Split::Train, scale.size));
@@ -109,17 +109,17 @@ fn stored(folder: &Path, scale: &Scale) -> Result<(Model<f32>, Dataset)> {
         return Err(Error::file(folder, "its scene has no test images to compare with"));
     }
     let mut model = run.model()?;
-    // What its views leave out of their own accord is for the settings to say.
+    // Each setting sets its own ray tolerance, so that of the model is dropped.
     if let Some(Marching { config, grid, .. }) = model.marching().cloned() {
         model.sampler = Box::new(Marching::new(config, grid));
     }
     Ok((model, data))
 }
 
-/// What views are compared with.
+/// Reference renders of the test views.
 struct Reference {
     images: Vec<Image>,
-    /// The PSNR of one of the [`RULES`] against the other, in dB.
+    /// PSNR of one of the [`RULES`] against the other, in dB.
     apart: f64,
 }
 
@@ -158,7 +158,7 @@ fn measure(
     let count = reference.len() as f64;
     let run = |setting: &Setting, model: &Model<f32>| {
         for frame in &views.frames {
-            // What can fail has not failed above.
+            // The same call has succeeded above.
             let _ = std::hint::black_box(setting.render(model, &frame.camera));
         }
     };
@@ -170,12 +170,12 @@ fn measure(
     Ok(Outcome { setting: setting.clone(), evaluations, psnr, largest, truth, timed, dominated: false })
 }
 
-/// Evaluations of density and of colour.
+/// Density queries plus colour queries.
 fn work(evaluations: &Evaluations) -> u64 {
     evaluations.density + evaluations.color
 }
 
-/// Marks settings that another one beats in work and in PSNR against the reference, in both or in one with the other equal.
+/// Marks dominated settings. Another setting is at least as good in work and in PSNR, and better in one of them.
 fn mark_dominated(outcomes: &mut [Outcome]) {
     let places: Vec<(u64, f64)> = outcomes.iter().map(|o| (work(&o.evaluations), o.psnr)).collect();
     for (outcome, own) in outcomes.iter_mut().zip(&places) {
@@ -184,8 +184,7 @@ fn mark_dominated(outcomes: &mut [Outcome]) {
     }
 }
 
-/// Numbers that one evaluation of the density and one of the colour takes: look-ups of table rows, bytes of them, and
-/// floating-point operations of matrix products.
+/// Cost of one density query and of one colour query: table look-ups, their bytes, and FLOP of matrix products.
 fn cost(model: &Model<f32>) -> [[u64; 3]; 2] {
     let field: &dyn Any = &*model.field;
     let grid = field.downcast_ref::<Instant>().map(Instant::grid).or(field.downcast_ref::<Voxel>().map(Voxel::grid));
@@ -246,7 +245,7 @@ fn table(outcomes: &[Outcome], model: &Model<f32>, pixels: f64) -> Table {
     table
 }
 
-/// A title, the label of an axis, and what it shows of an outcome.
+/// Title, axis label, and the value of an outcome.
 type Quantity = (&'static str, &'static str, fn(&Outcome) -> f64);
 
 fn figure(outcomes: &[Outcome], pixels: f64, by_time: bool) -> Figure {
@@ -333,7 +332,7 @@ mod tests {
     use raygrad::nerf::space::occupancy::Skip;
 
     #[test]
-    fn what_another_beats_is_dominated() {
+    fn mark_dominated_on_work_and_psnr() {
         let outcome = |evaluations: u64, psnr: f64| Outcome {
             setting: Setting::base(0.01),
             evaluations: Evaluations { density: evaluations, ..Evaluations::default() },
@@ -346,7 +345,7 @@ mod tests {
         let mut outcomes = [(10, 40.0), (20, 60.0), (20, 50.0), (30, 60.0), (5, 30.0)].map(|(e, p)| outcome(e, p));
         mark_dominated(&mut outcomes);
         assert_eq!(outcomes.each_ref().map(|o| o.dominated), [false, false, true, true, false]);
-        // A panel shows them apart, hollow where they are beaten, and a line through the others, of evaluations alone.
+        // Dominated settings are a hollow series. A line joins the others in the first panel, and only by evaluations.
         let lines = |by_time: bool| {
             let figure = figure(&outcomes, 10.0, by_time);
             let shown = figure.panels.iter().map(|panel| {
@@ -363,9 +362,9 @@ mod tests {
         assert_eq!(front.points, [[0.5, 30.0], [1.0, 40.0], [2.0, 60.0]], "from few to many");
     }
 
-    /// Gates on counts and errors, never on times.
+    /// Limits counts and errors. Times are too noisy for limits.
     #[test]
-    fn a_small_sweep_is_within_its_gates() {
+    fn sweep_small_is_within_limits() {
         let scale = Scale { steps: 60, size: 32, views: 1, rounds: 1 };
         let (model, views) = trained(&scale).unwrap();
         let Reference { images: reference, apart } = references(&model, &views).unwrap();
@@ -382,7 +381,7 @@ mod tests {
         assert!(work(&fast.evaluations) <= work(&lossless.evaluations));
         assert!(work(&lossless.evaluations) <= work(&off.evaluations));
         assert!(off.psnr >= lossless.psnr - 0.01 && lossless.psnr >= 40.0, "{} {}", off.psnr, lossless.psnr);
-        // The bound is that of a fog at the threshold all along a ray, of ending early and of the colour budget.
+        // The error bound of skipping, plus those of early termination and of the colour budget.
         let bound = |skip: Skip| {
             let limits = RayTolerance::of(&skip.into());
             skip.error_bound() + f64::from(limits.early_stop_eps + limits.color_budget)

@@ -1,4 +1,4 @@
-//! One page with everything.
+//! The HTML page of a benchmark.
 
 use std::path::Path;
 
@@ -8,17 +8,17 @@ use super::table::Table;
 use crate::html::escaped;
 use crate::machine;
 
-/// What one suite contributes.
+/// Results of one suite.
 pub struct Section {
-    /// Its heading.
+    /// Heading of the section.
     pub title: String,
-    /// The command that measures it again.
+    /// Command that reproduces the results.
     pub command: String,
     /// SVG and caption of each figure.
     pub figures: Vec<(String, String)>,
     /// Tables.
     pub tables: Vec<Table>,
-    /// Sentences.
+    /// Summary sentences.
     pub findings: Vec<String>,
 }
 
@@ -27,7 +27,7 @@ const STYLE: &str = "body{font:15px/1.5 sans-serif;max-width:1250px;margin:2em a
     table{border-collapse:collapse;font-size:13px}td,th{padding:.15em .7em;text-align:right;border-bottom:1px solid #ddd}\
     td:first-child,th:first-child{text-align:left}code{background:#f2f2f2;padding:.1em .3em}details{margin:1em 0}";
 
-/// Writes the page; it needs no other file. `mark` says what wrote it.
+/// Writes the page, which is self-contained. `mark` identifies the job that wrote it.
 pub fn save(path: &Path, sections: &[Section], quick: bool, mark: &str) -> Result<()> {
     let mut page = String::from("<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">");
     page += &format!("<meta name=\"generator\" content=\"{mark}\">");

@@ -1,23 +1,23 @@
-//! Times on a machine that does other things too: what is compared runs in turns.
+//! Interleaved timing for machines with other load.
 
 use std::time::Instant;
 
-/// What comparing something with a baseline found.
+/// Timing of a function relative to a baseline.
 #[derive(Debug, Clone, Copy)]
 pub struct Timed {
-    /// Seconds of a run: the median.
+    /// Median time of a run, in seconds.
     pub seconds: f64,
-    /// Seconds of a run of the baseline: the median.
+    /// Median time of a run of the baseline, in seconds.
     pub baseline: f64,
-    /// How many times as long it takes as the baseline: the median over the rounds.
+    /// Time relative to the baseline: the median over the rounds.
     pub ratio: f64,
-    /// The same for the baseline and itself: the median of the control.
+    /// Time of the baseline relative to itself: the median of the control.
     pub control: f64,
-    /// The distance between the quartiles of the control: ratios that differ by less are the same.
+    /// Interquartile range of the control. Ratios that differ by less are equal.
     pub spread: f64,
 }
 
-/// Runs `a` (the baseline) and `b` in the order A B B A, `rounds` times after one that does not count. The control is the
+/// Runs `a` (the baseline) and `b` in the order A B B A, `rounds` times after one warm-up round. The control is the
 /// ratio of the two runs of A in a round.
 pub fn compare(rounds: usize, mut a: impl FnMut(), mut b: impl FnMut()) -> Timed {
     let time = |f: &mut dyn FnMut()| {
@@ -40,7 +40,7 @@ pub fn compare(rounds: usize, mut a: impl FnMut(), mut b: impl FnMut()) -> Timed
     }
 }
 
-/// The value below which a share `q` of the values lies, interpolated.
+/// The `q`-quantile of the values, interpolated.
 pub fn quantile(q: f64, mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     let place = q * (values.len() - 1) as f64;
@@ -55,7 +55,7 @@ mod tests {
     use std::cell::RefCell;
 
     #[test]
-    fn runs_take_turns() {
+    fn compare_runs_in_abba_order() {
         let order = RefCell::new(String::new());
         let timed = compare(2, || order.borrow_mut().push('a'), || order.borrow_mut().push('b'));
         assert_eq!(*order.borrow(), "ababbaabba");
@@ -63,7 +63,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_are_interpolated() {
+    fn quantile_between_values_interpolates() {
         assert_eq!(quantile(0.5, vec![3.0, 1.0, 2.0]), 2.0);
         assert_eq!(quantile(0.25, vec![1.0, 2.0, 3.0, 5.0]), 1.75);
         assert_eq!(quantile(0.5, vec![7.0]), 7.0);

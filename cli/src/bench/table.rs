@@ -1,17 +1,17 @@
-//! Figures as text: CSV.
+//! Result tables as CSV.
 
 use std::path::Path;
 
 use raygrad::nerf::{Result, write_atomic};
 
-/// Rows of numbers and words under headings.
+/// A table with column headings.
 #[derive(Debug, Clone)]
 pub struct Table {
-    /// The name of its file.
+    /// File name without extension.
     pub name: String,
-    /// What a column holds, with its unit.
+    /// Column headings with units.
     pub columns: Vec<&'static str>,
-    /// One cell a column each.
+    /// Cells, row by row.
     pub rows: Vec<Vec<String>>,
 }
 
@@ -24,7 +24,8 @@ impl Table {
     /// Adds a row.
     ///
     /// # Panics
-    /// If it has not one cell for each column.
+    ///
+    /// Panics if the number of cells differs from the number of columns.
     pub fn push(&mut self, row: Vec<String>) {
         assert_eq!(row.len(), self.columns.len(), "one cell a column in {}", self.name);
         self.rows.push(row);
@@ -46,7 +47,7 @@ fn line<'a>(cells: impl Iterator<Item = &'a str>) -> String {
     cells.map(cell).collect::<Vec<_>>().join(",") + "\n"
 }
 
-/// A number with four digits; empty if it is not finite.
+/// A number with four significant digits; empty if it is not finite.
 pub fn digits(value: f64) -> String {
     match value.abs() {
         _ if !value.is_finite() => String::new(),
@@ -64,13 +65,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_have_four_digits() {
+    fn digits_four_are_significant() {
         let texts = [0.0, 1.0, 12.3456, 123456.0, 1.23456e-7, -0.5, f64::NAN].map(digits);
         assert_eq!(texts, ["0", "1.000", "12.35", "123456", "1.235e-7", "-0.5000", ""]);
     }
 
     #[test]
-    fn cells_with_commas_are_quoted() {
+    fn csv_cell_with_comma_is_quoted() {
         let mut table = Table::new("t", &["a", "b"]);
         table.push(vec!["1,2".into(), "say \"x\"".into()]);
         let folder = tempfile::tempdir().unwrap();

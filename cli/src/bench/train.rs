@@ -1,4 +1,4 @@
-//! Training: quality against time and against work.
+//! Benchmark of training: quality against time and against work.
 
 use std::ops::ControlFlow;
 use std::process::Command;
@@ -17,7 +17,7 @@ use super::figure::{Axis, Figure, Panel, Series};
 use super::table::{Table, digits};
 use crate::output::note;
 
-/// One way to train.
+/// A training configuration.
 struct Course {
     preset: Preset,
     skip: Skip,
@@ -35,17 +35,17 @@ impl Course {
     }
 }
 
-/// What a model was after some training.
+/// Quality of a model at one time of training.
 struct Point {
     stats: StepStats,
     psnr: f64,
 }
 
-/// Trains all courses. With `peers`, the paces of PyTorch and JAX too.
+/// Trains all courses. With `peers`, also adds curves at the speeds of PyTorch and JAX.
 pub fn run(quick: bool, peers: bool) -> Result<Results> {
     let size = if quick { 64 } else { 200 };
     let data = Arc::new(embedded(Split::Train, size));
-    // Smaller, since the classic model takes a minute for a view of the size it learns from.
+    // Half size, since the classic model takes a minute to render a view of full size.
     let mut test = embedded(Split::Test, size / 2);
     test.frames = evenly_spaced(test.frames, if quick { 1 } else { 3 });
     let courses = courses(quick);
@@ -113,12 +113,12 @@ fn courses(quick: bool) -> Vec<Course> {
     plan.iter().flat_map(seeds).collect()
 }
 
-/// Density evaluations, and those of colours and gradients.
+/// Density queries plus colour queries, which have gradients.
 fn evaluations(stats: &StepStats) -> f64 {
     (stats.density_queries + stats.color_queries) as f64
 }
 
-/// The model after 1, 1.5, 2.25 ... seconds, and at the end.
+/// Evaluates the model after 1, 1.5, 2.25 ... seconds, and at the end.
 fn train(course: &Course, data: &Arc<Dataset>, test: &Dataset) -> Result<Vec<Point>> {
     let config = Config { seed: course.seed, ..Config::preset(course.preset) };
     let budget = Budget::Time(Duration::from_secs(course.seconds));
@@ -174,7 +174,7 @@ fn table(courses: &[Course], curves: &[Vec<Point>]) -> Table {
     table
 }
 
-/// The curves over something, one colour for each kind of course.
+/// The curves over a quantity of the steps, one colour per kind of course.
 fn by(courses: &[Course], curves: &[Vec<Point>], x: impl Fn(&StepStats) -> f64) -> Vec<Series> {
     let mut names: Vec<String> = courses.iter().map(Course::name).collect();
     names.dedup();
@@ -186,8 +186,8 @@ fn by(courses: &[Course], curves: &[Vec<Point>], x: impl Fn(&StepStats) -> f64) 
     courses.iter().zip(curves).map(line).collect()
 }
 
-/// Adds the classic course at the pace of PyTorch and of JAX: the same steps give the same model, so what differs is the
-/// time of a step, which the scripts measure on this machine.
+/// Adds the classic course at the speeds of PyTorch and JAX. Equal steps give the same model, so that only the time of
+/// a step differs. The scripts measure it on this machine.
 fn add_peers(
     quick: bool,
     courses: &[Course],
@@ -215,7 +215,7 @@ fn add_peers(
     }
 }
 
-/// What `benches/peers/classic_nerf.py` reports for a training step.
+/// Seconds of a training step according to `benches/peers/classic_nerf.py`.
 fn seconds_a_step(framework: &str, quick: bool) -> std::result::Result<f64, String> {
     let script = "benches/peers/classic_nerf.py";
     if !std::path::Path::new(script).is_file() {
@@ -241,7 +241,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn courses_are_named_by_what_is_unusual_in_them() {
+    fn course_name_lists_non_default_settings() {
         let name = |preset, skip| Course { preset, skip, seed: 0, seconds: 1 }.name();
         assert_eq!(name(Preset::Instant, Skip::NearLossless), "instant");
         assert_eq!(name(Preset::Voxel, Skip::Off), "voxel, no skipping");

@@ -1,16 +1,16 @@
-//! The nearest and farthest depth that a photograph shows, which LLFF needs.
+//! Near and far depth of images, for LLFF.
 
 use raygrad::nerf::Result;
 use raygrad::nerf::dataset::{Capture, Point, View};
 use raygrad::nerf::glam::DVec3;
 
-/// Fewer points in a photograph say nothing of its depths.
+/// Fewest points of an image for an estimate of its depths.
 const FEWEST: usize = 20;
-/// The share of points that may be wrong at either end, as LLFF has it.
+/// The fraction of points that are cut as outliers at either end, as in LLFF.
 const WRONG: f64 = 0.001;
 
-/// The depths of each view: those that the file has, else those of the points that it shows, else those of the box that
-/// holds the scene. Says beside how many are of the last kind.
+/// The depths of each view: from the file, else from its points, else from the scene box. Also returns the number of
+/// views that use the box.
 pub fn of(capture: &Capture) -> Result<(Vec<[f64; 2]>, usize)> {
     let found: Vec<_> = capture.views.iter().map(|view| view.bounds.or_else(|| shown(view, &capture.points))).collect();
     let guessed = found.iter().filter(|bounds| bounds.is_none()).count();
@@ -30,7 +30,7 @@ pub fn of(capture: &Capture) -> Result<(Vec<[f64; 2]>, usize)> {
     Ok((all.collect(), guessed))
 }
 
-/// The depths of the points that a photograph shows.
+/// The near and far depth of the points that an image shows.
 fn shown(view: &View, points: &[Point]) -> Option<[f64; 2]> {
     let camera = &view.camera;
     let depth = |point: DVec3| {

@@ -1,4 +1,4 @@
-//! A dataset in another format.
+//! Conversion of a dataset to another format.
 
 use std::collections::HashSet;
 use std::path::{Component, Path, PathBuf};
@@ -33,7 +33,7 @@ pub enum Target {
 }
 
 impl Target {
-    /// The one that is this format.
+    /// The target of this format.
     pub fn of(format: Format) -> Self {
         match format {
             Format::Blender => Target::Blender,
@@ -43,12 +43,13 @@ impl Target {
         }
     }
 
-    /// Whether the format has one camera without a lens for all photographs, in whose middle is its principal point.
+    /// Returns true if the format has one camera for all images, without distortion and with the principal point in the
+    /// centre.
     pub fn is_plain(self) -> bool {
         matches!(self, Target::Llff | Target::Blender)
     }
 
-    /// Where in a folder of this format an image is, and what its view is called. `inner` is its path among the images.
+    /// File name and view name of an image in a folder of this format. `inner` is its path within the image folder.
     fn place(self, inner: &str, rest: &str, split: Option<Split>) -> (String, String) {
         let flat = |name: &str| name.replace('/', "_");
         match self {
@@ -76,28 +77,28 @@ impl Target {
     }
 }
 
-/// A photograph on its way.
+/// An image to convert.
 struct Job {
-    /// As it was.
+    /// The view in the source.
     from: View,
-    /// As it is to be; its files are in the new folder.
+    /// The view in the target. Its files are in the new folder.
     to: View,
-    /// The camera that it is seen by, if its pixels change.
+    /// The new camera, if the image must be resampled.
     seen_by: Option<Camera>,
 }
 
-/// Writes a capture in another format to `out`, images and all. Files that lie elsewhere than in the capture are copied if they
-/// are allowed to: its files may name any, and who gets the new dataset would read them.
+/// Converts a capture to another format in `out`, with images. Without `outside`, files outside of the capture's folder
+/// are refused. A capture may name any file, and those who receive the dataset could read it.
 pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside: bool, out: &Path) -> Work<()> {
     if undistorted || target == Target::Llff {
-        // Nothing can be made of images that are absent, and the format has none.
+        // The format cannot hold views without images.
         capture.views.retain(|view| view.image.is_some());
     }
     if capture.present().next().is_none() && undistorted {
         return Err(Error::file(&capture.file, "none of its images exists: check their paths").into());
     }
     for view in &mut capture.views {
-        // Images may be smaller than the file of the cameras says; other programs want to be told.
+        // Images may be smaller than the camera file states. The target needs the actual size.
         if view.image.is_some() {
             view.camera = view.camera_of_image().map_err(|e| Error::field(&capture.file, &view.field, e))?;
         }
@@ -118,7 +119,7 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside:
     }
     let views = jobs.iter().map(|job| job.to.clone()).collect();
     let written = Capture { folder: place.folder().into(), views, ..capture.clone() };
-    // First, so that what the format cannot hold is said before anything is copied.
+    // Written first, so that unsupported features fail before images are copied.
     target.write(&written, place.folder())?;
     Progress::new().each(jobs.len(), "images written", |i| Ok(jobs[i].run()?))?;
     place.finish()?;
@@ -129,7 +130,7 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside:
     Ok(())
 }
 
-/// Whether all files of a capture lie in its folder, wherever links lead.
+/// Fails if a file of a capture is outside of its folder. Links are resolved.
 fn check_inside(capture: &Capture) -> Result<()> {
     let root = Root::of_capture(capture)?;
     for view in &capture.views {
@@ -152,7 +153,7 @@ fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
             parts.push(format!("{count} {what}"));
         }
     }
-    // Of a scene that is built in, its pictures were nowhere for long.
+    // The images of a built-in scene have only been in a temporary folder.
     let from = if capture.file.starts_with(&capture.folder) { &capture.folder } else { &capture.file };
     print(&format!("capture  {} ({})\n", from.display(), capture.format))?;
     if let Some(Camera { width, height, .. }) = jobs.iter().find_map(|job| job.seen_by.as_ref()) {
@@ -161,7 +162,7 @@ fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
     print(&format!("scene    {}: {}\n", out.display(), parts.join(", ")))
 }
 
-/// What is to be done with each photograph.
+/// The job of each image.
 fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> Result<Vec<Job>> {
     let has_masks = target != Target::Llff;
     let has_depths = target == Target::Nerfstudio && !undistorted;
@@ -191,7 +192,7 @@ fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> 
         let mut to = view.clone();
         to.image = view.image.as_ref().map(|_| folder.join(&image));
         to.name = name;
-        // COLMAP's names.
+        // COLMAP's naming.
         to.mask = view.mask.as_ref().filter(|_| has_masks).map(|_| folder.join("masks").join(format!("{inner}.png")));
         to.depth = view.depth.as_ref().filter(|_| has_depths).map(|(path, unit)| {
             let ending = path.extension().unwrap_or_default();
@@ -209,7 +210,8 @@ fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> 
     Ok(jobs)
 }
 
-/// The path of a view's image in the folder of its capture, with slashes; that of one from elsewhere is its name alone.
+/// The path of a view's image relative to the capture's folder, with slashes. Images from elsewhere give their file
+/// name.
 pub fn relative(folder: &Path, view: &View) -> Result<String> {
     let path = view.image.as_deref().unwrap_or(Path::new(&view.name));
     let inside = match path.strip_prefix(folder) {
@@ -217,7 +219,7 @@ pub fn relative(folder: &Path, view: &View) -> Result<String> {
         Err(_) if path.is_relative() && view.image.is_none() => path,
         Err(_) => Path::new(path.file_name().unwrap_or_default()),
     };
-    // What is beside the folder has its names from there on.
+    // For a path outside of the folder, the part after the last `..`.
     let parts = inside.components().rev().take_while(|part| !matches!(part, Component::ParentDir));
     let parts: Option<Vec<&str>> = parts
         .filter_map(|part| match part {
@@ -231,7 +233,7 @@ pub fn relative(folder: &Path, view: &View) -> Result<String> {
     }
 }
 
-/// The part of a path in a folder of images: `0.jpg` of `images/0.jpg` and of `images_4/0.jpg`.
+/// The path within an image folder: `0.jpg` for `images/0.jpg` and `images_4/0.jpg`.
 fn inner(path: &str) -> &str {
     match path.split_once('/') {
         Some((first, rest)) if first == "images" || first.starts_with("images_") => rest,
@@ -242,7 +244,7 @@ fn inner(path: &str) -> &str {
 impl Job {
     fn run(&self) -> Result<()> {
         let Job { from, to, seen_by } = self;
-        // What is copied byte by byte is what it claims to be.
+        // The file is copied unchanged, so its content is checked.
         if let (Some((from, _)), Some((to, _))) = (&from.depth, &to.depth) {
             Depths::check_file(from)?;
             copy_file(from, to)?;
@@ -287,7 +289,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn images_go_where_their_format_has_them() {
+    fn place_follows_the_target_format() {
         let of = |target: Target, rest: &str| target.place(inner(rest), rest, Some(Split::Test));
         let pair = |image: &str, name: &str| (image.to_owned(), name.to_owned());
         for (rest, target, image, name) in [

@@ -1,4 +1,4 @@
-//! A folder of photographs, without cameras.
+//! Folders of images without cameras.
 
 use std::path::{Path, PathBuf};
 
@@ -11,12 +11,13 @@ use crate::interrupt::Work;
 use crate::output::complain;
 use crate::progress::Progress;
 
-/// Endings of images that can be read.
+/// File extensions that raygrad reads.
 const READ: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
-/// Endings of images that cannot.
+/// File extensions that raygrad does not read.
 const NOT_READ: [&str; 9] = ["heic", "heif", "avif", "tif", "tiff", "dng", "cr2", "nef", "arw"];
 
-/// Copies the images `found` in a folder to `images`, each turned upright. Follows links that lead elsewhere if `outside`.
+/// Copies the images `found` in a folder to `images` and applies their EXIF orientation. `outside` allows links to
+/// other folders.
 pub fn copy(folder: &Path, found: &[PathBuf], outside: bool, place: &Workplace) -> Work<usize> {
     if !outside {
         let root = Root::new(folder)?;
@@ -29,13 +30,13 @@ pub fn copy(folder: &Path, found: &[PathBuf], outside: bool, place: &Workplace) 
     Ok(found.len())
 }
 
-/// Whether the file's name has one of these extensions.
+/// Returns true if the file name has one of these extensions.
 fn ends(path: &Path, endings: &[&str]) -> bool {
     let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
     endings.iter().any(|known| known.eq_ignore_ascii_case(ending))
 }
 
-/// Refuses a single image where a folder or a video belongs.
+/// Refuses a single image as the input.
 pub fn check_no_image(file: &Path) -> Result<()> {
     match ends(file, &READ) || ends(file, &NOT_READ) {
         true => Err(Error::file(file, "is a single image: name the folder that holds the images")),
@@ -43,7 +44,7 @@ pub fn check_no_image(file: &Path) -> Result<()> {
     }
 }
 
-/// The images, in no order in particular. Warns of those that raygrad cannot read.
+/// The images in a folder, unsorted. Warns of images that raygrad cannot read.
 pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
     let inner = folder.join("images");
     for folder in [folder, &inner] {

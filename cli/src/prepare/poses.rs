@@ -1,4 +1,4 @@
-//! Cameras of photographs, as COLMAP finds them.
+//! Camera poses from COLMAP.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -13,34 +13,34 @@ use crate::interrupt::Work;
 use crate::output::{entries, note};
 use crate::progress::Progress;
 
-/// Photographs up to which every pair is compared, also of a video: so a walk around something closes.
+/// Up to this number of images, COLMAP matches all pairs. This closes loops of a video.
 const EXHAUSTIVE: usize = 200;
-/// Where COLMAP works until it is done.
+/// Temporary folder of COLMAP.
 const FOLDER: &str = "work";
-/// What it calls the processor that it should do without, in the order from new versions to old.
+/// Options that disable the GPU, for new and old versions.
 const EXTRACTION: [&str; 2] = ["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"];
 const MATCHING: [&str; 2] = ["FeatureMatching.use_gpu", "SiftMatching.use_gpu"];
-/// What the mapper says, with exit code 1, when there is nothing to find: [`find`] has better words for it.
+/// The mapper's output, with exit code 1, if it finds no model. [`find`] reports this case itself.
 const NO_MODEL: &str = "failed to create sparse model";
 
-/// What COLMAP has found.
+/// Result of COLMAP.
 #[derive(Debug, PartialEq)]
 pub struct Found {
-    /// How many photographs have a camera now.
+    /// Number of registered images.
     pub registered: usize,
-    /// The names of the others.
+    /// Names of the other images.
     pub lost: Vec<String>,
-    /// How many models there were, of which the largest is kept.
+    /// Number of models. Only the largest is kept.
     pub models: usize,
 }
 
-/// Whether COLMAP can be run.
+/// Fails if COLMAP cannot be run.
 pub fn check() -> Work<()> {
     COLMAP.check()
 }
 
-/// Finds the cameras of the photographs in `images` and leaves them in `sparse/0`. `sequence` says that the photographs are
-/// frames of a video, in order; `model` is COLMAP's name of a kind of camera.
+/// Finds the camera poses of `images` and writes them to `sparse/0`. `sequence` is true for frames of a video, in
+/// order. `model` is COLMAP's name of a camera model.
 pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
     let images = place.folder().join("images");
     let names = names(&images)?;
@@ -49,7 +49,7 @@ pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
 
     let mut arguments = vec!["--ImageReader.camera_model", model];
     if colmap.one_size(&names)? {
-        // One lens is known better from all photographs than each from one.
+        // A shared camera has more accurate intrinsics.
         arguments.extend(["--ImageReader.single_camera", "1"]);
     }
     colmap.step("feature_extractor", Some(EXTRACTION), "extracting features", &arguments)?;
@@ -60,7 +60,7 @@ pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
     colmap.step(matcher, Some(MATCHING), "matching images", &[])?;
     let found = colmap.map(&place.make(&format!("{FOLDER}/models"))?, names.len())?;
     let count = found.len();
-    // Of equals, the one that was found first.
+    // If sizes are equal, the first model is kept.
     let largest = found.into_iter().rev().max_by_key(|(_, capture)| capture.views.len());
     let Some((folder, capture)) = largest else {
         let what = "found no camera poses: the images overlap too little, are blurred or lack texture; take more \
@@ -74,7 +74,7 @@ pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
     Ok(Found { registered, lost: lost(names, &capture), models: count })
 }
 
-/// The photographs that have no camera.
+/// The images without a camera.
 fn lost(names: Vec<String>, capture: &Capture) -> Vec<String> {
     names.into_iter().filter(|name| capture.views.iter().all(|view| view.name != *name)).collect()
 }
@@ -97,7 +97,7 @@ struct Colmap {
 }
 
 impl Colmap {
-    /// Whether all photographs are of one size, as those of one camera are.
+    /// Returns true if all images have one size, which suggests a single camera.
     fn one_size(&self, names: &[String]) -> Result<bool> {
         let mut first = None;
         for name in names {
@@ -109,7 +109,7 @@ impl Colmap {
         Ok(true)
     }
 
-    /// Runs one of COLMAP's steps that counts what it has done.
+    /// Runs a COLMAP command that prints its progress as a count.
     fn step(&self, step: &str, gpu: Option<[&str; 2]>, words: &str, arguments: &[&str]) -> Work<()> {
         let mut command = COLMAP.command();
         command.arg(step).arg("--database_path").arg(&self.database);
@@ -118,7 +118,7 @@ impl Colmap {
         }
         command.args(arguments);
         let help = COLMAP.ask(&[step, "-h"])?;
-        // There may be no graphics processor, or no display to use it without a window.
+        // There may be no GPU, or no display to use it without a window.
         if let Some(name) = gpu.iter().flatten().find(|name| help.contains(**name)) {
             command.arg(format!("--{name}")).arg("0");
         }
@@ -129,8 +129,8 @@ impl Colmap {
         })
     }
 
-    /// Finds the cameras, which COLMAP says one by one, and begins with none for each model that it tries: the models and their
-    /// folders in `models`.
+    /// Runs the mapper and returns its models with their folders. COLMAP prints each registered image and restarts the
+    /// count for each model.
     fn map(&self, models: &Path, total: usize) -> Work<Vec<(PathBuf, Capture)>> {
         let mut command = COLMAP.command();
         let paths: [(&str, &OsStr); 3] = [
@@ -169,7 +169,7 @@ mod tests {
     use super::registered;
 
     #[test]
-    fn registrations_are_counted() {
+    fn registered_parses_old_and_new_output() {
         assert_eq!(registered("I20240101 incremental.cc:418] Registering image #12 (13)"), Some(13));
         assert_eq!(registered("Registering image #12 (num_reg_frames=7)"), Some(7));
         for line in ["", "=> Image sees 120 / 300 points", "Registering image #12", "Registering image #1 (x)"] {

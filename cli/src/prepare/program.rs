@@ -1,4 +1,4 @@
-//! Other programs: where they are, what they say while they run, and how they end.
+//! External programs: running them and reading their output.
 
 use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, ErrorKind, Read};
@@ -11,28 +11,28 @@ use raygrad::nerf::Error;
 use crate::interrupt::{self, Stop, Work};
 use crate::output::note;
 
-/// Lines that are kept of what a program has said, and shown if it fails.
+/// Lines of output that are shown if a program fails.
 const KEPT: usize = 12;
-/// How often it is looked whether there was a Ctrl-C.
+/// Interval of checks for Ctrl-C.
 const INTERVAL: Duration = Duration::from_millis(100);
 
-/// A program that is installed beside this one.
+/// An external program.
 #[derive(Debug, Clone, Copy)]
 pub struct Program {
-    /// What it is called on the command line.
+    /// Name of the command.
     name: &'static str,
-    /// How it is installed.
+    /// Installation instructions.
     install: &'static str,
 }
 
-/// Takes videos apart.
+/// Reads videos.
 pub const FFMPEG: Program = Program {
     name: "ffmpeg",
     install: "`apt install ffmpeg`, `brew install ffmpeg`, `conda install -c conda-forge ffmpeg` or \
               `winget install Gyan.FFmpeg`",
 };
 
-/// Finds out where photographs were taken from.
+/// Finds camera poses.
 pub const COLMAP: Program = Program {
     name: "colmap",
     install: "`apt install colmap`, `brew install colmap`, `conda install -c conda-forge colmap`, or for Windows \
@@ -40,15 +40,15 @@ pub const COLMAP: Program = Program {
 };
 
 impl Program {
-    /// What it says to these arguments, however it ends: for questions that are answered at once.
+    /// Runs a short command and returns its output, whatever its exit code.
     pub fn ask<S: AsRef<std::ffi::OsStr>>(&self, arguments: &[S]) -> Work<String> {
         let output = Command::new(self.name).args(arguments).stdin(Stdio::null()).output();
         let output = output.map_err(|e| self.unusable(&e))?;
         Ok([output.stdout, output.stderr].map(|text| String::from_utf8_lossy(&text).into_owned()).concat())
     }
 
-    /// Runs it to its end and tells every line that it says. If it fails, its last lines are shown; if there is a Ctrl-C, it
-    /// is ended. One that says the words of `excuse` has not failed, whatever its exit code.
+    /// Runs a command and passes each line of output to `line`. Shows the last lines if it fails, and ends it after
+    /// Ctrl-C. Output that contains `excuse` counts as success, whatever the exit code.
     pub fn run(&self, command: &mut Command, excuse: Option<&str>, mut line: impl FnMut(&str)) -> Work<()> {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().map_err(|e| self.unusable(&e))?;
@@ -83,7 +83,7 @@ impl Program {
             }
         }
         let status = child.wait().map_err(|e| self.unusable(&e))?;
-        // From a terminal, Ctrl-C reaches both, and the program may end first.
+        // A terminal sends Ctrl-C to both programs, and the child may end first.
         if interrupt::requested() {
             return Err(Stop::Interrupted);
         }
@@ -99,12 +99,12 @@ impl Program {
         Err(Error::setting(name, format!("failed ({}), {above}", ending(status))).into())
     }
 
-    /// A command that runs it.
+    /// Creates a command for the program.
     pub fn command(&self) -> Command {
         Command::new(self.name)
     }
 
-    /// Whether it can be run at all.
+    /// Fails if the program cannot be run.
     pub fn check(&self) -> Work<()> {
         self.ask(&["-h"]).map(drop)
     }
@@ -118,20 +118,20 @@ impl Program {
     }
 }
 
-/// Whether a line is one of those by which ffmpeg reports its progress, which are no last words: `out_time_us=1240000`.
+/// Returns true for progress lines of ffmpeg, such as `out_time_us=1240000`. They are left out of error messages.
 fn is_count(line: &str) -> bool {
     line.split_once('=')
         .is_some_and(|(name, _)| name.bytes().all(|c| c.is_ascii_lowercase() || c == b'_' || c.is_ascii_digit()))
 }
 
-/// Sends the lines of a stream, in a thread of its own: a program stops when nobody reads what it says.
+/// Reads a stream in a separate thread and sends its lines. A program would block if nothing read its output.
 fn listen(stream: impl Read + Send + 'static, sender: Sender<String>) {
     std::thread::spawn(move || {
         let mut stream = BufReader::new(stream);
         let mut bytes = vec![];
         while matches!(stream.read_until(b'\n', &mut bytes), Ok(count) if count > 0) {
             let text = String::from_utf8_lossy(&bytes);
-            // What a program writes over itself on a terminal counts as it was last.
+            // After carriage returns, only the last text of a line counts.
             let last = text.trim_end().rsplit('\r').next().unwrap_or_default().trim_end().to_owned();
             bytes.clear();
             if !last.is_empty() && sender.send(last).is_err() {
@@ -141,7 +141,7 @@ fn listen(stream: impl Read + Send + 'static, sender: Sender<String>) {
     });
 }
 
-/// Ends a program. That it has ended already is no error.
+/// Ends a child process, which may have ended already.
 fn end(child: &mut Child) {
     let _ = child.kill();
     let _ = child.wait();
@@ -151,7 +151,7 @@ fn ending(status: ExitStatus) -> String {
     status.code().map_or_else(|| status.to_string(), |code| format!("exit code {code}"))
 }
 
-/// The last fraction `12/120` in brackets that a line has, as COLMAP counts: `[12/120]`, or `[3/8, 2/8]` of blocks of blocks.
+/// The last `12/120` in brackets as a fraction. COLMAP prints `[12/120]`, or `[3/8, 2/8]` for nested blocks.
 pub fn counted(line: &str) -> Option<f64> {
     let inside = line.rsplit_once('[')?.1.split_once(']')?.0;
     let mut share = 0.0;
@@ -162,7 +162,7 @@ pub fn counted(line: &str) -> Option<f64> {
         if !(all >= 1.0 && (0.0..=all).contains(&done)) {
             return None;
         }
-        // It counts from 1, and what is counted has only begun but for the last of parts.
+        // COLMAP counts from 1. All but the innermost count name a block that has only begun.
         share += size * (done - 1.0).max(0.0) / all;
         size /= all;
     }
@@ -174,7 +174,7 @@ mod tests {
     use super::{counted, is_count};
 
     #[test]
-    fn progress_of_ffmpeg_is_no_last_word() {
+    fn is_count_for_ffmpeg_progress_only() {
         for line in ["frame=12", "stream_0_0_q=-1.0", "out_time=00:00:01.2", "progress=continue"] {
             assert!(is_count(line), "{line}");
         }
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_of_colmap_are_read() {
+    fn counted_parses_colmap_progress() {
         for (line, share) in [
             ("I1122 10:00:00 feature.cc:1] Processed file [12/120]", 0.1),
             ("Matching block [1/2, 2/2]", 0.5),

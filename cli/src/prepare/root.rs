@@ -1,4 +1,4 @@
-//! The folder that the files of a dataset lie in, wherever links lead.
+//! The root folder of a dataset's files, with links resolved.
 
 use std::path::{Path, PathBuf};
 
@@ -9,12 +9,13 @@ use raygrad::nerf::{Error, Result};
 pub struct Root(PathBuf);
 
 impl Root {
-    /// A folder that is there.
+    /// Creates the root of an existing folder.
     pub fn new(folder: &Path) -> Result<Self> {
         resolved(folder).map(Root).map_err(|what| Error::file(folder, what))
     }
 
-    /// The folder of a capture. Of a model of COLMAP in `scene/sparse/0` or in `scene/sparse`, it is `scene`, which holds the images.
+    /// The folder of a capture. For a COLMAP model in `scene/sparse/0` or `scene/sparse`, it is `scene`, which holds
+    /// the images.
     pub fn of_capture(capture: &Capture) -> Result<Self> {
         let Root(whole) = Self::new(&capture.folder)?;
         let sparse = whole.ancestors().take(2).find(|folder| folder.ends_with("sparse"));
@@ -22,7 +23,7 @@ impl Root {
         Ok(Root(scene.unwrap_or(&whole).to_owned()))
     }
 
-    /// Whether a file lies in the folder; if not, what is wrong and what to do.
+    /// Fails with the reason and the fix if a file is outside of the folder.
     pub fn check(&self, file: &Path) -> std::result::Result<(), String> {
         if resolved(file)?.starts_with(&self.0) {
             return Ok(());
@@ -32,7 +33,7 @@ impl Root {
     }
 }
 
-/// Where a path leads.
+/// The path with links resolved.
 fn resolved(path: &Path) -> std::result::Result<PathBuf, String> {
     path.canonicalize().map_err(|e| format!("{} cannot be found: {e}", path.display()))
 }
@@ -44,7 +45,7 @@ mod tests {
     use std::os::unix::fs::symlink;
 
     #[test]
-    fn root_holds_what_no_link_leads_out_of() {
+    fn check_refuses_links_out_of_the_root() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         fs::create_dir_all(path("scene/sparse/0")).unwrap();
@@ -70,9 +71,9 @@ mod tests {
             }
             assert!(root.check(&path("scene/absent.png")).unwrap_err().contains("cannot be found"));
         }
-        // Another folder is not a part for the beginning of its name.
+        // A common prefix of names does not count.
         assert!(Root::new(&path("scene")).unwrap().check(&path("scene2/b.png")).is_err());
-        // Only a model of COLMAP belongs to the folder above, and that by its name.
+        // Only COLMAP models use the parent folder, and only for this folder name.
         assert!(of("scene/sparse", Format::Transforms).unwrap().check(&path("scene/a.png")).is_err());
         assert!(of("scene2", Format::Colmap).unwrap().check(&path("c.png")).is_err());
         assert!(of("absent", Format::Colmap).is_err());

@@ -1,11 +1,10 @@
-//! Which camera each photograph is to be seen by.
+//! Target cameras of undistortion.
 
 use raygrad::nerf::{Camera, Lens, Result};
 
-/// Replaces cameras by such without a lens, and says of photographs whose pixels change by which camera they are seen.
+/// Replaces cameras by ones without distortion. Sets the source camera of images that must be resampled.
 ///
-/// A camera without a lens stays as it is; but if all are to be alike (`plain`), photographs are seen by one camera whose
-/// principal point is in the middle.
+/// Cameras without distortion stay unchanged. With `plain`, all images get one camera with a centred principal point.
 pub fn plan(views: &mut dyn Iterator<Item = (&mut Camera, &mut Option<Camera>)>, plain: bool) -> Result<()> {
     let mut views: Vec<_> = views.collect();
     let mut kinds: Vec<Camera> = vec![];
@@ -39,12 +38,12 @@ pub fn plan(views: &mut dyn Iterator<Item = (&mut Camera, &mut Option<Camera>)>,
     Ok(())
 }
 
-/// Whether two cameras differ in their poses alone.
+/// Returns true if two cameras differ in their poses alone.
 fn alike(a: &Camera, b: &Camera) -> bool {
     (a.width, a.height, a.focal, a.centre, a.lens) == (b.width, b.height, b.focal, b.centre, b.lens)
 }
 
-/// Whether a camera is one that every format holds.
+/// Returns true if every format supports this camera.
 fn is_plain(camera: &Camera) -> bool {
     let Camera { width, height, focal, centre, lens, .. } = camera;
     *lens == Lens::Pinhole && focal[0] == focal[1] && *centre == [0.5 * *width as f64, 0.5 * *height as f64]

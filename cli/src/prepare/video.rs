@@ -1,4 +1,4 @@
-//! Sharp frames of a video.
+//! Extraction of sharp frames.
 
 use std::path::{Path, PathBuf};
 
@@ -11,21 +11,22 @@ use crate::interrupt::Work;
 use crate::output::entries;
 use crate::progress::Progress;
 
-/// Frames that are looked at for each that is kept.
+/// Candidate frames per selected frame.
 const CANDIDATES: usize = 3;
-/// Where those are until then.
+/// Temporary folder of the candidates.
 const FOLDER: &str = "candidates";
 
-/// What ffmpeg says of a video.
+/// Properties of a video from ffmpeg.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Video {
-    /// Its length in seconds.
+    /// Length in seconds.
     seconds: f64,
-    /// Frames in a second.
+    /// Frames per second.
     rate: f64,
 }
 
-/// Writes about `count` sharp frames of a video to `images`: of three frames that follow one another, the sharpest.
+/// Writes about `count` sharp frames of a video to `images`. Of each three consecutive candidates, the sharpest is
+/// kept.
 pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
     let said = FFMPEG.ask(&["-hide_banner".as_ref(), "-nostdin".as_ref(), "-i".as_ref(), video.as_os_str()])?;
     let Some(about) = Video::parse(&said) else {
@@ -39,7 +40,7 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
     let mut command = FFMPEG.command();
     command.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-nostats", "-progress", "pipe:1", "-i"]);
     command.arg(video).arg("-map").arg("0:v:0").arg("-vf").arg(format!("fps={rate:.6}"));
-    // The best JPEG there is: 1 is taken only where the least is 1 too.
+    // The best JPEG quality. ffmpeg uses 1 only if the minimum is 1 too.
     command.args(["-qmin", "1", "-q:v", "1"]).arg(folder.join("%06d.jpg"));
     FFMPEG.run(&mut command, None, |line| {
         let Some(frame) = line.strip_prefix("frame=").and_then(|n| n.trim().parse::<f64>().ok()) else { return };
@@ -55,7 +56,7 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
 }
 
 impl Video {
-    /// From the lines `Duration: 00:01:23.45, ..` and `Stream #0:0: Video: .., 29.97 fps, ..`.
+    /// Parses the lines `Duration: 00:01:23.45, ..` and `Stream #0:0: Video: .., 29.97 fps, ..`.
     fn parse(said: &str) -> Option<Video> {
         let stream = said.lines().find(|line| line.contains(" Video: "))?;
         let rate = stream.split(',').find_map(|part| {
@@ -71,9 +72,9 @@ impl Video {
     }
 }
 
-/// Moves the sharpest of every few candidates to a folder, and says how many those are.
+/// Moves the sharpest frame of each group of candidates to a folder and returns their number.
 fn keep_sharp(candidates: &[PathBuf], count: usize, to: &Path, progress: &Progress) -> Work<usize> {
-    // A short video has fewer frames than are asked for: no more than those are thrown away.
+    // A short video has fewer candidates, so that groups are smaller.
     let group = ((candidates.len() as f64 / count as f64).round() as usize).clamp(1, CANDIDATES);
     let sharpness = progress.each(candidates.len(), "frames rated for sharpness", |i| {
         Ok(if group == 1 { 0.0 } else { Photo::open(&candidates[i], None)?.sharpness() })
@@ -94,7 +95,7 @@ mod tests {
     use super::Video;
 
     #[test]
-    fn what_ffmpeg_says_of_videos_is_read() {
+    fn parse_ffmpeg_output_gives_length_and_rate() {
         let said = "Input #0, mov,mp4, from 'walk.mp4':\n  Metadata:\n    creation_time   : 2024-05-01\n  \
                     Duration: 00:01:02.50, start: 0.000000, bitrate: 9 kb/s\n  Stream #0:1[0x2](und): Audio: aac, 2 fps\n  \
                     Stream #0:0[0x1](und): Video: h264 (avc1 / 0x31637661), yuv420p(tv, bt709), 1920x1080, 9 kb/s, \

@@ -1,4 +1,4 @@
-//! A folder that is there as a whole or not at all.
+//! Output folders that appear complete or not at all.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -8,18 +8,17 @@ use tempfile::TempDir;
 
 use crate::output::complain;
 
-/// A temporary folder on the disk of the folder that is to be. Dropped before it is [finished](Self::finish), nothing is left
-/// of it.
+/// A temporary folder on the disk of the output folder. It is removed if it is dropped before [`finish`](Self::finish).
 pub struct Workplace {
     temporary: TempDir,
     out: PathBuf,
-    /// Whether the folder was there, empty, before: then the temporary one lies in it.
+    /// True if the output folder existed and was empty. The temporary folder is then inside it.
     is_inside: bool,
 }
 
 impl Workplace {
-    /// For a folder that does not exist yet, or is empty. One that is empty stays itself: it may be a mount point, a symbolic
-    /// link's target, or all that is writable there.
+    /// Creates a temporary folder for an output folder that is absent or empty. An empty folder is kept. It may be a
+    /// mount point, the target of a link, or the only writable folder.
     pub fn new(out: &Path) -> Result<Self> {
         let bad = |e: std::io::Error| Error::file(out, format!("cannot be created: {e}"));
         let is_inside = match others(out) {
@@ -42,26 +41,27 @@ impl Workplace {
         std::fs::create_dir_all(folder).map_err(bad)?;
         let mut builder = tempfile::Builder::new();
         let prefix = format!(".{}{PREFIX}", name.to_string_lossy());
-        // Temporary folders are private by default; this one becomes an ordinary one, as far as the umask allows.
+        // Temporary folders are private by default. This one gets the permissions of an ordinary folder, subject to the
+        // umask.
         #[cfg(unix)]
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
         let temporary = builder.prefix(&prefix).tempdir_in(folder).map_err(bad)?;
         Ok(Workplace { temporary, out: absolute, is_inside })
     }
 
-    /// Where to work.
+    /// The temporary folder.
     pub fn folder(&self) -> &Path {
         self.temporary.path()
     }
 
-    /// Makes a folder in it.
+    /// Creates a subfolder.
     pub fn make(&self, name: &str) -> Result<PathBuf> {
         let folder = self.folder().join(name);
         std::fs::create_dir_all(&folder).map_err(|e| Error::file(&folder, format!("cannot be created: {e}")))?;
         Ok(folder)
     }
 
-    /// Removes a folder in it that has done its work. What cannot be removed is said, and stays: the work is worth more.
+    /// Removes a subfolder that is no longer needed. Failure gives a warning only, since the other files are valid.
     pub fn remove(&self, name: &str) {
         let path = self.folder().join(name);
         if let Err(e) = std::fs::remove_dir_all(&path) {
@@ -69,13 +69,15 @@ impl Workplace {
         }
     }
 
-    /// Puts the folder where it is to be.
+    /// Moves the folder to its final path.
     ///
     /// # Errors
-    /// If that has come to hold files, or cannot be written any more. The finished work then stays, and the error says where.
+    ///
+    /// Fails if that path now holds files or is not writable. The finished work is kept, and the error names its
+    /// folder.
     pub fn finish(self) -> Result<()> {
         let Workplace { temporary, out, is_inside } = self;
-        // From here on nothing is removed, whatever fails.
+        // Disables the removal on drop, so that errors below keep the work.
         let done = temporary.keep();
         let moved = if is_inside { move_up(&done, &out) } else { std::fs::rename(&done, &out) };
         moved.map_err(|e| {
@@ -85,12 +87,12 @@ impl Workplace {
     }
 }
 
-/// What follows the name of a folder in that of its temporary one.
+/// Suffix of the temporary folder, after the name of the output folder.
 const PREFIX: &str = "-unfinished-";
-/// What empty folders hold on some systems.
+/// Files of empty folders on some systems.
 const NOTHING: [&str; 2] = ["lost+found", ".DS_Store"];
 
-/// What a folder holds but for temporary ones, such as that of a program that was killed.
+/// The entries of a folder, except for temporary ones, such as those of a killed program.
 fn others(folder: &Path) -> std::io::Result<Vec<OsString>> {
     let names = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.file_name()));
     let is_other = |name: &OsString| {
@@ -100,7 +102,7 @@ fn others(folder: &Path) -> std::io::Result<Vec<OsString>> {
     Ok(names.collect::<std::io::Result<Vec<_>>>()?.into_iter().filter(is_other).collect())
 }
 
-/// Moves all that is in a folder to the one that holds it and nothing else.
+/// Moves all entries of a folder to its parent, which holds nothing else.
 fn move_up(from: &Path, to: &Path) -> std::io::Result<()> {
     if !others(to)?.is_empty() {
         return Err(std::io::Error::other("it is no longer empty"));
@@ -117,7 +119,7 @@ mod tests {
     use super::*;
     use std::fs;
 
-    /// A workplace with a file of finished work.
+    /// A workplace with a finished file.
     fn filled(out: &Path) -> Workplace {
         let place = Workplace::new(out).unwrap();
         fs::write(place.make("images").unwrap().join("0.png"), b"work").unwrap();
@@ -131,7 +133,7 @@ mod tests {
         names
     }
 
-    /// The folder that an error says the work is kept in.
+    /// The folder that the error names.
     fn kept(error: &Error) -> PathBuf {
         let message = error.to_string();
         let (_, kept) = message.split_once("the result is complete: move it from ").unwrap();
@@ -139,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn work_goes_to_new_and_to_empty_folders() {
+    fn finish_moves_to_new_and_empty_folders() {
         let folder = tempfile::tempdir().unwrap();
         let [new, empty] = ["a/new", "empty"].map(|name| folder.path().join(name));
         fs::create_dir(&empty).unwrap();
@@ -149,21 +151,21 @@ mod tests {
         }
         assert_eq!(names(folder.path()), ["a", "empty"]);
         assert_eq!(names(&folder.path().join("a")), ["new"]);
-        // What cannot be removed keeps nobody from finishing.
+        // A failed removal does not prevent finishing.
         let place = filled(&folder.path().join("finished"));
         place.remove("absent");
         place.remove("images");
         place.finish().unwrap();
         assert!(names(&folder.path().join("finished")).is_empty());
         fs::remove_dir(folder.path().join("finished")).unwrap();
-        // A folder is empty that holds what its system has put there, or a killed program.
+        // Files of the system or of a killed program do not count.
         fs::remove_dir_all(&empty).unwrap();
         fs::create_dir_all(empty.join("lost+found")).unwrap();
         fs::create_dir_all(empty.join(".empty-unfinished-abc")).unwrap();
         let other = filled(&empty);
         filled(&empty).finish().unwrap();
         assert_eq!(fs::read(kept(&other.finish().unwrap_err()).join("images/0.png")).unwrap(), b"work");
-        // A workplace that is dropped unfinished leaves nothing.
+        // An unfinished workplace is removed on drop.
         let gone = folder.path().join("gone");
         drop(filled(&gone));
         fs::create_dir(&gone).unwrap();
@@ -175,10 +177,10 @@ mod tests {
     }
 
     #[test]
-    fn work_is_kept_when_the_last_step_fails() {
+    fn finish_failing_keeps_the_work() {
         let folder = tempfile::tempdir().unwrap();
         let file = |kept: &Path| fs::read(kept.join("images/0.png")).unwrap();
-        // An empty folder, and one that does not exist, gain a file meanwhile.
+        // An empty folder and an absent one, which gain a file during the work.
         for exists in [true, false] {
             let out = folder.path().join(format!("gains-{exists}"));
             if exists {
@@ -192,7 +194,7 @@ mod tests {
             assert_eq!(file(&kept(&error)), b"work");
             assert_eq!(fs::read(out.join("notes.txt")).unwrap(), b"mine");
         }
-        // A file takes the place of the folder.
+        // A file replaces the folder.
         let out = folder.path().join("file");
         let place = filled(&out);
         fs::write(&out, b"mine").unwrap();
@@ -215,7 +217,7 @@ mod tests {
             Workplace::new(&lost).err().unwrap().to_string().contains("is a symbolic link to a folder that does not")
         );
         assert_eq!(names(folder.path()), ["link", "lost", "target"]);
-        // As of any folder that is made here.
+        // The permissions of a new folder.
         let [made, new] = ["made", "new"].map(|name| folder.path().join(name));
         fs::create_dir(&made).unwrap();
         filled(&new).finish().unwrap();

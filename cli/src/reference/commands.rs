@@ -9,9 +9,9 @@ use super::{compare, markdown, sentence, wrap};
 use crate::Cli;
 use crate::tests::commands;
 
-/// How an argument is written on the command line.
+/// The syntax of an argument.
 fn usage(arg: &Arg) -> String {
-    // Styles are those of terminals; the plain text is what `to_string` gives without them.
+    // Styles are for terminals. Without them, `to_string` gives plain text.
     let text = arg.to_string();
     match arg.get_short() {
         Some(short) if arg.get_long().is_some() => format!("-{short}, {text}"),
@@ -19,7 +19,7 @@ fn usage(arg: &Arg) -> String {
     }
 }
 
-/// The message about this value of an argument; `None` if the value is accepted.
+/// The error message for this value of an argument; `None` if the value is valid.
 fn refusal(command: &str, arg: &Arg, value: &str) -> Option<String> {
     let flag = format!("--{}={value}", arg.get_long()?);
     let words: Vec<&str> = if command == "raygrad" { vec!["raygrad"] } else { vec!["raygrad", command] };
@@ -28,7 +28,7 @@ fn refusal(command: &str, arg: &Arg, value: &str) -> Option<String> {
     Some(text.split_once("': ")?.1.to_owned())
 }
 
-/// `0 is not in 1..=1024` as `1 to 1024`.
+/// Converts `0 is not in 1..=1024` to `1 to 1024`.
 fn range(refused: &str) -> Option<String> {
     let (_, range) = refused.split_once(" is not in ")?;
     let (low, high) = range.split_once("..")?;
@@ -37,7 +37,7 @@ fn range(refused: &str) -> Option<String> {
     Some(if is_open { format!("{low} or more") } else { format!("{low} to {high}") })
 }
 
-/// The values that a flag accepts, in words: from its definition, or from what its parser says about a value that is none.
+/// The valid values of a flag in words, from its definition or from its parser's error message.
 fn values(command: &str, arg: &Arg) -> Option<String> {
     if let Some(range) = ["0", "99999999999999999999", "18446744073709551615", "4000000000"]
         .iter()
@@ -61,13 +61,12 @@ fn values(command: &str, arg: &Arg) -> Option<String> {
     })
 }
 
-/// A flag without its value, or an argument.
+/// The name of a flag without its value, or of an argument.
 fn name(arg: &Arg) -> String {
     arg.get_long().map_or_else(|| usage(arg), |long| format!("--{long}"))
 }
 
-/// What is known of an argument beside its description, as short sentences; `said` and `default` are the range and the
-/// default that the description gives.
+/// Facts about an argument as short sentences. `said` and `default` are the range and the default in its description.
 fn facts(command: &Command, arg: &Arg, said: Option<&str>, default: Option<String>) -> Vec<String> {
     let mut facts = vec![];
     let possible: Vec<String> = arg.get_possible_values().iter().map(|v| format!("`{}`", v.get_name())).collect();
@@ -95,7 +94,7 @@ fn facts(command: &Command, arg: &Arg, said: Option<&str>, default: Option<Strin
     if arg.is_required_set() {
         facts.push("Required".into());
     }
-    // Either of two flags may say that they do not go together.
+    // clap lists a conflict for one of the two flags only.
     let own = command.get_arg_conflicts_with(arg);
     let conflicts = command.get_arguments().filter(|other| {
         own.iter().any(|own| own.get_id() == other.get_id())
@@ -108,7 +107,7 @@ fn facts(command: &Command, arg: &Arg, said: Option<&str>, default: Option<Strin
     facts
 }
 
-/// The description: the short line and, below it, the rest.
+/// The description: the short line, then the rest.
 fn description(short: Option<String>, long: Option<String>) -> Vec<String> {
     let text = long.or(short).unwrap_or_default();
     let mut paragraphs: Vec<String> = text.split("\n\n").map(|p| p.replace('\n', " ").trim().to_owned()).collect();
@@ -121,7 +120,7 @@ fn description(short: Option<String>, long: Option<String>) -> Vec<String> {
 
 fn entry(command: &Command, arg: &Arg) -> String {
     let text = description(arg.get_help().map(|s| s.to_string()), arg.get_long_help().map(|s| s.to_string()));
-    // Ranges and defaults in the text are facts.
+    // Ranges and defaults in the text become facts.
     let mut text = text.join(" ");
     let mut take = |before: &str, after: &str| {
         let (start, rest) = text.split_once(before)?;
@@ -145,7 +144,7 @@ fn entry(command: &Command, arg: &Arg) -> String {
     page
 }
 
-/// Whether this is `--help` or `--version`.
+/// Returns true for `--help` and `--version`.
 fn is_own_help(arg: &Arg) -> bool {
     matches!(arg.get_id().as_str(), "help" | "version")
 }
@@ -209,12 +208,12 @@ fn page() -> String {
 }
 
 #[test]
-fn commands_page_matches_the_program() {
+fn commands_page_equals_generated_text() {
     compare("commands.md", &page());
 }
 
 #[test]
-fn commands_page_names_every_flag() {
+fn commands_page_contains_every_flag() {
     let page = page();
     for command in commands() {
         for arg in command.get_arguments().filter(|arg| !is_own_help(arg) && !arg.is_hide_set()) {

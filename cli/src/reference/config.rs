@@ -1,5 +1,5 @@
-//! `docs/reference/config.md`: every key of `config.json`. Types and descriptions come from the sources, defaults from the presets,
-//! ranges from what [`Config::check`] says about absurd values.
+//! `docs/reference/config.md`: every key of `config.json`. Types and descriptions come from the sources, and defaults
+//! from the presets. Ranges come from the errors of [`Config::check`] for extreme values.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -12,7 +12,7 @@ use super::source::{Field, Sources};
 use super::{compare, markdown, wrap};
 use crate::run::RunConfig;
 
-/// Titles and introductions of the page's sections, by the name of the struct or enum.
+/// Titles and introductions of the sections, by name of the struct or enum.
 const TITLES: [(&str, &str, &str); 29] = [
     ("RunConfig", "Run", "The keys at the top of `config.json`."),
     ("Scene", "Scene", "A word, or an object with a folder."),
@@ -56,7 +56,7 @@ const TITLES: [(&str, &str, &str); 29] = [
         "Optimization of focal lengths and lenses. The learning rate of poses is the key `poses`.",
     ),
 ];
-/// The last of them.
+/// The last entry.
 const EXPOSURE: (&str, &str, &str) =
     ("ExposureConfig", "Exposure model", "What is learned of how images show the scene's colours.");
 
@@ -66,19 +66,19 @@ fn title(name: &str) -> (&'static str, &'static str) {
     found.map(|(_, title, text)| (*title, *text)).unwrap_or_else(|| panic!("`{name}` needs a title in TITLES"))
 }
 
-/// Where a sample of a configuration comes from.
+/// Origin of a sample configuration.
 #[derive(Clone, Copy, PartialEq)]
 enum Origin {
     Preset(&'static str),
-    /// A file that says as little as it may.
+    /// A file with the required keys only.
     Minimal,
-    /// A file that says all that can be said.
+    /// A file with all keys.
     Full,
     /// The keys that a minimal file lacks.
     Absent,
 }
 
-/// Configurations of runs as files may have them, which together have every key.
+/// Sample configurations of runs, which together have every key.
 fn samples() -> Vec<(Origin, Value)> {
     let preset = |preset: Preset| serde_json::to_value(Config::preset(preset)).unwrap();
     let run = |config: Value| {
@@ -168,7 +168,7 @@ fn walk(value: &Value, path: &str, keys: &mut Keys) {
     }
 }
 
-/// The value at a path; of lists the first.
+/// The value at a path; the first element of lists.
 fn at<'a>(value: &'a mut Value, path: &str) -> Option<&'a mut Value> {
     path.split('.').skip(1).try_fold(value, |value, part| {
         let name = part.split(['[', '{']).next()?;
@@ -183,7 +183,7 @@ fn at<'a>(value: &'a mut Value, path: &str) -> Option<&'a mut Value> {
     })
 }
 
-/// A struct or an enum, and the paths at which it stands.
+/// A struct or an enum, and its paths.
 struct Section {
     name: String,
     kind: Option<String>,
@@ -197,7 +197,7 @@ struct Schema<'a> {
     keys: BTreeSet<String>,
 }
 
-/// The type within `Option` and `Vec`, and what a path to it ends with.
+/// The type within `Option` and `Vec`, and the suffix of its path.
 fn inner(ty: &str) -> (&str, &'static str) {
     let ty = ty.strip_prefix("Option<").and_then(|ty| ty.strip_suffix('>')).unwrap_or(ty);
     match ty.strip_prefix("Vec<").and_then(|ty| ty.strip_suffix('>')) {
@@ -206,7 +206,7 @@ fn inner(ty: &str) -> (&str, &'static str) {
     }
 }
 
-/// The components that a type stands for.
+/// The component kinds of a type.
 fn family(ty: &str) -> Option<&'static str> {
     [("FieldConfig", "Fields"), ("SamplerConfig", "Samplers"), ("LossTermConfig", "LossTerms")]
         .into_iter()
@@ -249,7 +249,7 @@ impl Schema<'_> {
     }
 }
 
-/// Whether a variant is a word in a file.
+/// Returns true if files hold a variant as a word.
 fn is_word(variant: &Field) -> bool {
     variant.ty.is_empty() && variant.fields.is_empty()
 }
@@ -260,9 +260,9 @@ fn schema(sources: &Sources) -> Schema<'_> {
     schema
 }
 
-/// A description, its unit and its range.
+/// Splits a doc comment into description, unit and range.
 fn described(doc: &str) -> (String, Option<String>, Option<String>) {
-    // Links between items are for rustdoc.
+    // Links between items are for rustdoc only.
     let mut text = String::new();
     let mut rest = doc;
     while let Some((before, after)) = rest.split_once('[') {
@@ -287,7 +287,7 @@ fn described(doc: &str) -> (String, Option<String>, Option<String>) {
     };
     let range = take(&mut text, "Range: ");
     let unit = take(&mut text, "Unit: ");
-    // Names in Rust are for rustdoc, too.
+    // Rust names are for rustdoc only, too.
     while let Some((before, after)) = text.split_once(" See `") {
         let rest = after.split_once("`.").map_or("", |(_, rest)| rest).to_owned();
         text = format!("{before}{rest}");
@@ -295,7 +295,7 @@ fn described(doc: &str) -> (String, Option<String>, Option<String>) {
     (text, unit, range)
 }
 
-/// The range of a number: what [`Config::check`] asks for in place of absurd values.
+/// The range of a number, from the errors of [`Config::check`] for extreme values.
 fn range(path: &str, ty: &str, samples: &[(Origin, Value)]) -> Option<String> {
     let key = path.rsplit('.').next()?;
     let sample = samples.iter().find_map(|(_, sample)| {
@@ -377,7 +377,7 @@ fn anchor(title: &str) -> String {
     title.to_lowercase().replace(' ', "-")
 }
 
-/// A path as `--set` takes it.
+/// A path in the syntax of `--set`.
 fn shown(path: &str) -> String {
     let mut text = String::new();
     let mut is_kind = false;
@@ -393,7 +393,7 @@ fn shown(path: &str) -> String {
 fn value_words(value: &Value) -> Option<String> {
     match value {
         Value::Object(fields) if fields.contains_key("kind") => Some(format!("`{}`", fields["kind"].as_str()?)),
-        // Of an enum's variant that has fields.
+        // The variant of an enum with fields.
         Value::Object(fields) if fields.len() == 1 && fields.values().all(Value::is_object) => {
             Some(format!("`{value}`"))
         }
@@ -404,13 +404,13 @@ fn value_words(value: &Value) -> Option<String> {
     }
 }
 
-/// The defaults of a key of a section, as a sentence.
+/// The defaults of a section's key, as a sentence.
 fn defaults(section: &Section, field: &Field, keys: &[(Origin, Keys)]) -> Option<String> {
     let mut parts = vec![];
     for path in &section.paths {
         let full = format!("{path}.{}", field.name);
         let of = |value: &[Value]| value.iter().map(value_words).collect::<Option<Vec<_>>>().map(|all| all.join(", "));
-        // Each value with the presets that have it.
+        // Each value with its presets.
         let mut values: Vec<(String, Vec<&str>)> = vec![];
         for (origin, keys) in keys {
             if let (Origin::Preset(name), Some(value)) = (origin, keys.get(&full))
@@ -449,7 +449,7 @@ fn defaults(section: &Section, field: &Field, keys: &[(Origin, Keys)]) -> Option
     }
 }
 
-/// A key: its description, and below it what is known of it.
+/// The entry of a key: its description, then the facts.
 fn entry(schema: &Schema<'_>, section: &Section, field: &Field, below: &str, samples: &Samples) -> String {
     let sources = schema.sources;
     let (text, unit, said) = described(&field.doc);
@@ -471,7 +471,7 @@ fn entry(schema: &Schema<'_>, section: &Section, field: &Field, below: &str, sam
     let ty = field.ty.trim_start_matches("Option<").trim_end_matches('>');
     let found = range(&path, ty, &samples.values);
     if let (Some(found), Some(said)) = (&found, &said) {
-        // A range that depends on another key names it.
+        // A range that depends on another key names that key.
         assert!(
             found == said || said.contains('`'),
             "{path}: the code asks for `{found}`, the doc comment says `{said}`"
@@ -492,7 +492,7 @@ fn entry(schema: &Schema<'_>, section: &Section, field: &Field, below: &str, sam
     let (indent, bullet) = if below.is_empty() { ("  ", "- ") } else { ("    ", "  - ") };
     let mut page = wrap(bullet, indent, &format!("**`{}`**: {}", field.name, markdown(&text)));
     if !facts.is_empty() {
-        // A line break.
+        // A Markdown line break.
         page.insert(page.len() - 1, '\\');
         page += &wrap(indent, indent, &facts.iter().map(|fact| format!("{fact}.")).collect::<Vec<_>>().join(" "));
     }
@@ -542,7 +542,7 @@ impl Samples {
         Samples { values, keys }
     }
 
-    /// Whether presets have a key, or a file may lack it.
+    /// Returns true if presets have the key or a file may omit it.
     fn has_default(&self, path: &str) -> bool {
         let is_said = |origin: &Origin| matches!(origin, Origin::Preset(_) | Origin::Absent);
         self.keys.iter().any(|(origin, keys)| is_said(origin) && keys.contains_key(path))
@@ -622,12 +622,12 @@ fn page() -> String {
 }
 
 #[test]
-fn config_page_matches_the_program() {
+fn config_page_equals_generated_text() {
     compare("config.md", &page());
 }
 
 #[test]
-fn config_page_has_every_key() {
+fn config_page_contains_every_key() {
     let sources = Sources::read();
     let schema = schema(&sources);
     let keys: BTreeSet<String> = Samples::new().keys.into_iter().flat_map(|(_, keys)| keys.into_keys()).collect();
@@ -644,7 +644,7 @@ fn config_page_has_every_key() {
 }
 
 #[test]
-fn config_ranges_come_from_the_checks() {
+fn config_ranges_equal_those_of_check() {
     let samples = Samples::new().values;
     let range = |path: &str, ty: &str| range(path, ty, &samples);
     assert_eq!(range(".config.field{instant}.grid.levels", "usize").as_deref(), Some("1 to 32"));

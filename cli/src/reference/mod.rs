@@ -1,5 +1,5 @@
-//! The pages under `docs/reference` that are generated from the program: `UPDATE_SNAPSHOTS=1 cargo test -p raygrad-cli --bin
-//! raygrad reference` writes them.
+//! Generated pages of `docs/reference`. `UPDATE_SNAPSHOTS=1 cargo test -p raygrad-cli --bin raygrad reference` writes
+//! them.
 
 mod commands;
 mod config;
@@ -10,12 +10,12 @@ use std::path::{Path, PathBuf};
 /// Longest line of a page.
 const WIDTH: usize = 120;
 
-/// The folder of the workspace.
+/// The root of the workspace.
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// Compares a generated page with the file of this name, or writes that file.
+/// Compares a generated page with its file, or writes the file.
 #[track_caller]
 fn compare(name: &str, page: &str) {
     let file = root().join("docs/reference").join(name);
@@ -32,7 +32,7 @@ fn compare(name: &str, page: &str) {
     assert_eq!(page.len(), written.len(), "docs/reference/{name} is too long; UPDATE_SNAPSHOTS=1 writes it anew");
 }
 
-/// Words in lines of at most [`WIDTH`] characters: the first begins with `first`, the others are indented by `indent`.
+/// Wraps words in lines of at most [`WIDTH`] characters. The first line starts with `first`, the others with `indent`.
 fn wrap(first: &str, indent: &str, text: &str) -> String {
     let (mut page, mut line) = (String::new(), first.to_owned());
     let mut is_empty = true;
@@ -52,7 +52,7 @@ fn wrap(first: &str, indent: &str, text: &str) -> String {
     page + &line + "\n"
 }
 
-/// Plain text as Markdown: flags and what follows `Example:` as code, and characters that Markdown reads otherwise escaped.
+/// Converts plain text to Markdown. Flags and text after `Example:` become code, and special characters are escaped.
 fn markdown(text: &str) -> String {
     let (text, example) = match text.split_once("Example: ") {
         Some((text, example)) => (text, Some(example)),
@@ -79,14 +79,14 @@ fn markdown(text: &str) -> String {
     }
 }
 
-/// A sentence with its full stop.
+/// A text with a final full stop.
 fn sentence(text: &str) -> String {
     let text = text.trim();
     if text.is_empty() || text.ends_with(['.', ':', '?']) { text.to_owned() } else { format!("{text}.") }
 }
 
 #[test]
-fn wrapped_lines_are_short_and_keep_all_words() {
+fn wrap_keeps_words_within_width() {
     let text = "word ".repeat(100) + "`--set a=b` end";
     let page = wrap("- ", "  ", &text);
     assert!(page.lines().all(|line| line.chars().count() <= WIDTH));

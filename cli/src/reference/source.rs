@@ -1,51 +1,51 @@
-//! The structs and enums of configurations, as their source files have them: names, types, descriptions and earlier names.
+//! Structs and enums of configurations from their source files: names, types, descriptions and earlier names.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::root;
 
-/// A struct or an enum that is written to files.
+/// A serialised struct or enum.
 #[derive(Debug, Default)]
 pub struct Item {
     pub name: String,
     attributes: Vec<String>,
-    /// Of a struct.
+    /// Fields of a struct.
     pub fields: Vec<Field>,
-    /// Of an enum.
+    /// Variants of an enum.
     pub variants: Vec<Field>,
 }
 
 /// A field of a struct, or a variant of an enum.
 #[derive(Debug, Default, Clone)]
 pub struct Field {
-    /// As it is in files.
+    /// Name in files.
     pub name: String,
-    /// Its type; of a variant that holds a value, that of the value, and of another nothing.
+    /// Type of a field, or of a variant's value; empty for a variant without a value.
     pub ty: String,
-    /// Its doc comment.
+    /// Doc comment.
     pub doc: String,
-    /// Earlier names that are still read.
+    /// Earlier names that files may use.
     pub aliases: Vec<String>,
-    /// Whether a file may lack it.
+    /// True if files may omit it.
     pub optional: bool,
-    /// The fields of a variant that has some.
+    /// Fields of a variant.
     pub fields: Vec<Field>,
 }
 
-/// The items of the sources, and the configurations that a `kind` in a file names.
+/// The items of the sources, and the configuration of each `kind`.
 pub struct Sources {
     items: BTreeMap<String, Item>,
-    /// By the file's `kind`: the family, such as `Fields`, and the struct.
+    /// For each `kind` in files: the family, such as `Fields`, and the struct.
     pub kinds: Vec<(String, String, String)>,
 }
 
-/// The text between two others.
+/// The text between two markers.
 fn between<'a>(text: &'a str, before: &str, after: &str) -> Option<&'a str> {
     Some(text.split_once(before)?.1.split_once(after)?.0)
 }
 
-/// `PiecewiseLinear` as files name it under this rule.
+/// The name of a variant under a rename rule.
 fn renamed(variant: &str, rule: Option<&str>) -> String {
     match rule {
         None => variant.to_owned(),
@@ -63,14 +63,14 @@ impl Item {
         self.attributes.iter().find_map(|attribute| between(attribute, before, "\""))
     }
 
-    /// Whether files may lack any of its fields.
+    /// Returns true if files may omit fields.
     fn has_default(&self) -> bool {
         self.attributes.iter().any(|a| a.contains("serde(") && a.trim_end_matches(")]").ends_with("default"))
     }
 }
 
 impl Sources {
-    /// Reads the files in which configurations are defined.
+    /// Parses the files that define configurations.
     pub fn read() -> Self {
         let mut sources = Sources { items: BTreeMap::new(), kinds: vec![] };
         for folder in ["nerf/src", "autograd/nn/src", "cli/src"] {
@@ -108,7 +108,7 @@ impl Sources {
             }
         }
         for mut item in written {
-            // A second struct or enum says what a file may say beside.
+            // A second struct or enum defines other forms in files.
             if let Some(name) = item.attribute("from = \"") {
                 let stored = read.iter().find(|item| item.name == name).expect("the struct that is read");
                 item.absorb(stored);
@@ -139,7 +139,7 @@ impl Sources {
 }
 
 impl Item {
-    /// Takes over earlier names from the struct or enum that is read in place of this one.
+    /// Adds the earlier names of the struct or enum that deserialisation uses.
     fn absorb(&mut self, stored: &Item) {
         let fields = stored.fields.iter().chain(stored.variants.iter().flat_map(|variant| &variant.fields));
         for field in fields {
@@ -148,7 +148,7 @@ impl Item {
                     own.aliases.extend(field.aliases.clone());
                     own.optional |= stored.has_default();
                 }
-                // A key of earlier versions alone.
+                // A key of earlier versions only.
                 None => self.variants.push(Field { ty: "earlier".into(), ..field.clone() }),
             }
         }
@@ -157,7 +157,7 @@ impl Item {
     }
 }
 
-/// The structs and enums of a file, which is formatted by rustfmt.
+/// Parses the structs and enums of a file, which rustfmt has formatted.
 fn parse(text: &str) -> Vec<Item> {
     let (mut items, mut attributes) = (vec![], vec![]);
     let mut lines = text.lines().peekable();
@@ -183,7 +183,7 @@ fn parse(text: &str) -> Vec<Item> {
     items
 }
 
-/// Fields or variants, up to a closing brace.
+/// Parses fields or variants up to a closing brace.
 fn members<'a>(lines: &mut impl Iterator<Item = &'a str>, rule: Option<&str>, optional: bool) -> Vec<Field> {
     let (mut all, mut doc, mut attributes) = (vec![], vec![], String::new());
     while let Some(line) = lines.next() {
@@ -230,7 +230,7 @@ fn members<'a>(lines: &mut impl Iterator<Item = &'a str>, rule: Option<&str>, op
 }
 
 #[test]
-fn source_parser_reads_structs_and_enums() {
+fn parse_structs_and_enums_gives_members() {
     let text = "/// A.\n#[derive(Debug, Serialize, Deserialize)]\n#[serde(deny_unknown_fields, default)]\npub struct A {\n    \
                 /// One,\n    /// two.\n    #[serde(alias = \"old\")]\n    pub new: Vec<usize>,\n}\n\n#[derive(Serialize)]\n\
                 #[serde(rename_all = \"kebab-case\")]\nenum B {\n    /// Plain.\n    OneTwo,\n    /// Fields.\n    Three {\n        \

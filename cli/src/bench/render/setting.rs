@@ -1,4 +1,4 @@
-//! Ways to render one model.
+//! Renderer settings of the benchmark.
 
 use raygrad::Storage;
 use raygrad::nerf::sampling::marching::Marching;
@@ -6,43 +6,43 @@ use raygrad::nerf::space::occupancy::{Skip, Threshold, Update};
 use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::nerf::{Camera, Evaluations, Image, Model, RayTolerance, Result};
 
-/// The background of all pictures.
+/// Background of all renders.
 pub const WHITE: [f64; 3] = [1.0; 3];
 
-/// Which cells are passed over.
+/// The set of skipped cells.
 #[derive(Debug, Clone, Copy)]
 pub enum Cells {
-    /// Those that training passed over.
+    /// The cells that are empty in the grid of training.
     Trained,
-    /// Also those that an optical depth of so much along a ray may be in.
+    /// Also cells whose optical depth along a ray is below this value.
     Depth(f64),
-    /// Also those in which one random sample found less than this optical depth a step.
+    /// Also cells where one random sample has less than this optical depth per step.
     OneSample(f64),
 }
 
-/// One way to render.
+/// A renderer setting.
 #[derive(Debug, Clone)]
 pub struct Setting {
-    /// What it changes of the default.
+    /// Group of the changed parameter.
     pub group: &'static str,
-    /// What it is changed to.
+    /// Value of the changed parameter.
     pub name: String,
-    /// As a share of the longest side of the box.
+    /// Step as a fraction of the longest side of the box.
     pub step: f64,
-    /// Cells that are passed over.
+    /// Skipped cells.
     pub cells: Cells,
-    /// What is left out along a ray.
+    /// Tolerance of early termination and of skipped colour queries.
     pub limits: RayTolerance,
-    /// The rule for the integral along a ray.
+    /// Quadrature rule of the integral along a ray.
     pub rule: Quadrature,
-    /// All arithmetic in f64, nothing but empty cells left out.
+    /// True for f64 arithmetic that skips empty cells only.
     pub double: bool,
-    /// What the parameters are rounded to.
+    /// Storage type of the parameters.
     pub storage: Storage,
 }
 
 impl Setting {
-    /// What `raygrad render` does by default: the baseline of all times.
+    /// The default of `raygrad render`, the baseline of all times.
     pub fn base(step: f64) -> Self {
         Setting {
             group: "skip",
@@ -56,7 +56,7 @@ impl Setting {
         }
     }
 
-    /// The model with its sampler set so, and the cells emptied.
+    /// The model with the sampler and the occupancy grid of this setting.
     pub fn model(&self, model: &Model<f32>) -> Model<f32> {
         let mut model = model.clone();
         model.params.round_to(self.storage);
@@ -78,18 +78,18 @@ impl Setting {
                 sampler.grid.prune(min_sigma, &ask);
             }
             Cells::OneSample(depth) => {
-                // Occupied cells only, and nothing of what was known of them.
+                // Only occupied cells are queried again, and decay 0 forgets their earlier densities.
                 let plan = Update { every: u32::MAX, occupied_every: 1, samples: 1, decay: 0.0 };
                 sampler.grid.update(&plan, 0, 0, &ask);
                 let min_sigma = depth as f32 / sampler.view_step();
                 sampler.grid.threshold(&Threshold { min_sigma, or_mean: false, dilate: false });
             }
         }
-        // What the model leaves out of its own accord is forgotten.
+        // A new sampler without the ray tolerance of the model.
         Marching::new(sampler.config, sampler.grid)
     }
 
-    /// The view of such a [`model`](Self::model).
+    /// Renders a view with a model from [`model`](Self::model).
     pub fn render(&self, model: &Model<f32>, camera: &Camera) -> Result<(Image, Evaluations)> {
         if self.double {
             let view = model.cast::<f64>()?.render_reference(camera, WHITE, 1);
@@ -100,7 +100,7 @@ impl Setting {
     }
 }
 
-/// All settings; `step` is that of the model's views.
+/// All settings. `step` is the default step of the model.
 pub fn settings(step: f64) -> Vec<Setting> {
     let base = Setting::base(step);
     let exact = RayTolerance { early_stop_eps: 0.0, color_budget: 0.0 };
