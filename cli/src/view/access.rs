@@ -1,4 +1,4 @@
-//! Who may ask, and what browsers are told of every answer.
+//! Access control of the viewer, and security headers of its responses.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -13,12 +13,12 @@ use serde::Deserialize;
 
 use super::served::Served;
 
-/// Nothing from elsewhere, and nothing of it elsewhere.
+/// Allows resources of this server only, and no embedding in other pages.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; \
                       connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// Lets nobody in who comes by another name than this machine has: a page of elsewhere, whose name leads here since a moment ago,
-/// could read all. And no page of elsewhere.
+/// Refuses requests with foreign host names, which prevents DNS rebinding. Also refuses requests from pages of other
+/// origins.
 pub async fn check_access(State(served): State<Arc<Served>>, request: Request, next: Next) -> Response {
     let refused = refusal(request.headers(), &served.host);
     let mut response = match refused {
@@ -39,7 +39,7 @@ pub async fn check_access(State(served): State<Arc<Served>>, request: Request, n
     response
 }
 
-/// Why a request is not answered, if it is not.
+/// The error response for a request, if it is refused.
 fn refusal(headers: &HeaderMap, own: &str) -> Option<(StatusCode, &'static str)> {
     let text = |name| headers.get(name).map(|value: &HeaderValue| value.to_str().unwrap_or_default());
     let host = text(header::HOST).unwrap_or_default();
@@ -51,7 +51,7 @@ fn refusal(headers: &HeaderMap, own: &str) -> Option<(StatusCode, &'static str)>
     foreign.then_some((StatusCode::FORBIDDEN, "Requests from other sites are not allowed.\n"))
 }
 
-/// Whether a `Host` is an address, which no name can be turned to, or one of this machine's names.
+/// Returns true if a `Host` is an IP address or a name of this machine. DNS cannot redirect addresses.
 fn is_own(host: &str, own: &str) -> bool {
     let Ok(authority) = host.parse::<Authority>() else { return false };
     let name = authority.host().trim_start_matches('[').trim_end_matches(']');
@@ -61,27 +61,27 @@ fn is_own(host: &str, own: &str) -> bool {
             || (!own.is_empty() && name.eq_ignore_ascii_case(own)))
 }
 
-/// Whether an `Origin` is that of a page from here.
+/// Returns true if an `Origin` is this server's.
 fn is_same(origin: &str, host: &str) -> bool {
     origin
         .parse::<Uri>()
         .is_ok_and(|origin| origin.authority().is_some_and(|authority| authority.as_str().eq_ignore_ascii_case(host)))
 }
 
-/// What a link ends with.
+/// The access token in a link's query.
 #[derive(Deserialize)]
 pub struct AccessToken {
     token: Option<String>,
 }
 
 impl AccessToken {
-    /// Whether it lets somebody in where this token is asked for, or none.
+    /// Returns true if the token is correct or none is required.
     pub fn opens(&self, token: Option<&str>) -> bool {
         token.is_none_or(|token| self.token.as_deref().is_some_and(|own| is_equal(own, token)))
     }
 }
 
-/// Whether two texts are the same, in a time that does not tell where they differ.
+/// Compares texts in constant time.
 fn is_equal(a: &str, b: &str) -> bool {
     a.len() == b.len() && a.bytes().zip(b.bytes()).fold(0, |apart, (a, b)| apart | (a ^ b)) == 0
 }
@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_addresses_and_own_names_are_served() {
+    fn host_accepts_addresses_and_own_names_only() {
         for host in
             ["127.0.0.1:7007", "127.0.0.1", "[::1]:80", "localhost:7007", "LOCALHOST", "192.168.1.9:1", "box.lan:7007"]
         {
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn only_pages_from_here_may_ask() {
+    fn origin_of_other_sites_is_refused() {
         assert!(is_same("http://127.0.0.1:7007", "127.0.0.1:7007") && is_same("https://box.lan", "box.lan"));
         for origin in [
             "null",
@@ -129,10 +129,10 @@ mod tests {
     }
 
     #[test]
-    fn a_token_is_that_one_and_no_other() {
+    fn token_other_than_the_own_is_refused() {
         let opens = |given: Option<&str>, token| AccessToken { token: given.map(str::to_owned) }.opens(token);
         assert!(opens(None, None) && opens(Some("abc"), None) && opens(Some("abc"), Some("abc")));
-        // None, longer and shorter ones, and those whose differences are as many in one direction as in the other.
+        // No token, other lengths, and differences that cancel each other in a sum.
         for given in [None, Some(""), Some("ab"), Some("abcd"), Some("abd"), Some("ABC"), Some("bac"), Some("cba")] {
             assert!(!opens(given, Some("abc")), "{given:?}");
         }

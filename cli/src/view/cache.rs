@@ -1,32 +1,32 @@
-//! What takes long to make, made beside all else, of which a few are kept.
+//! A cache of values that are computed in a background thread.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use raygrad::nerf::Result;
 
-/// What comes of asking for something.
+/// Result of a request to the cache.
 pub enum Cached<V> {
     Here(Arc<V>),
-    /// It is being made, or something else before it.
+    /// This value or another one is being computed.
     Coming,
-    /// Why it cannot be had; who asks again lets it be tried again.
+    /// The computation failed with this message. The next request tries again.
     Failed(String),
 }
 
-/// Makes one thing at a time and keeps those that were asked for last.
+/// Computes one value at a time and keeps the most recently used ones.
 pub struct Cache<K, V>(Arc<Mutex<State<K, V>>>);
 
 struct State<K, V> {
     most: usize,
-    /// What was used last comes first.
+    /// Most recently used first.
     kept: VecDeque<(K, Arc<V>)>,
     coming: Option<K>,
     failed: Option<(K, String)>,
 }
 
 impl<K: Copy + PartialEq + Send + 'static, V: Send + Sync + 'static> Cache<K, V> {
-    /// One that keeps so many.
+    /// A cache of at most this many values.
     pub fn new(most: usize) -> Self {
         Cache(Arc::new(Mutex::new(State { most, kept: VecDeque::new(), coming: None, failed: None })))
     }
@@ -35,8 +35,8 @@ impl<K: Copy + PartialEq + Send + 'static, V: Send + Sync + 'static> Cache<K, V>
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What is kept under this key; if it is not, it begins to be made on a thread of its own, which calls `done` when it has
-    /// ended.
+    /// Returns the value of a key. If it is not cached, starts its computation in a thread, which calls `done` at the
+    /// end.
     pub fn get(
         &self,
         key: K,
@@ -54,7 +54,7 @@ impl<K: Copy + PartialEq + Send + 'static, V: Send + Sync + 'static> Cache<K, V>
             state.coming = Some(key);
             let store = Cache(self.0.clone());
             let run = move || {
-                // Of a panic it is not waited for either.
+                // A panic counts as a failure, so that callers do not wait forever.
                 let made = std::panic::catch_unwind(std::panic::AssertUnwindSafe(make));
                 let made =
                     made.map_err(|_| "loading failed".to_owned()).and_then(|made| made.map_err(|e| e.to_string()));
@@ -75,7 +75,7 @@ impl<K: Copy + PartialEq + Send + 'static, V: Send + Sync + 'static> Cache<K, V>
         Cached::Coming
     }
 
-    /// The same at once, on this thread.
+    /// Like [`get`](Self::get), but computes the value on this thread.
     pub fn get_now(&self, key: K, make: impl FnOnce() -> Result<V>) -> Result<Arc<V>> {
         if let Some(found) = self.lock().find(key) {
             return Ok(found);
@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_used_last_is_kept() {
+    fn cache_full_evicts_the_least_recently_used() {
         let store = Cache::new(2);
         let again = |key| match store.get(key, || panic!("it is here"), || ()) {
             Cached::Here(value) => Some(*value),
@@ -124,7 +124,7 @@ mod tests {
         wait(&store, 1, Ok(10));
         wait(&store, 2, Ok(20));
         assert_eq!(again(1), Some(10));
-        // The one that was used longest ago makes room.
+        // The least recently used value is evicted.
         wait(&store, 3, Ok(30));
         assert_eq!([again(1), again(3)], [Some(10), Some(30)]);
         assert_eq!(*store.get_now(1, || panic!("it is here")).unwrap(), 10);

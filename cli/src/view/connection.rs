@@ -1,4 +1,4 @@
-//! A page, from when it comes to when it goes: what it says, and what it is sent.
+//! The WebSocket connection of a page.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,19 +15,19 @@ use super::messages::{ClientMessage, File};
 use super::requests::{Outbox, Outgoing, sorry};
 use super::served::{Limits, Served};
 
-/// Quality of photographs as JPEG files, 1 to 100.
+/// JPEG quality of images, 1 to 100.
 const QUALITY: u8 = 88;
-/// Bytes that a close frame has room for, and some to spare.
+/// Longest reason in a close frame, in bytes, below the limit of the protocol.
 const REASON: usize = 120;
 
-/// One page.
+/// The connection of one page.
 pub struct Connection {
     client: u64,
     outbox: Arc<Outbox>,
     served: Arc<Served>,
-    /// Whether a photograph is being read.
+    /// Held while an image is read.
     reader: Arc<Semaphore>,
-    /// Whether something is being sent.
+    /// True while a message is being sent.
     sending: AtomicBool,
 }
 
@@ -38,7 +38,7 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// One that comes, if there is room for it.
+    /// Creates the connection if there are fewer pages than the limit.
     pub fn join(served: Arc<Served>) -> Option<Self> {
         let (client, outbox) = served.requests.join(served.limits.pages)?;
         Some(Connection {
@@ -50,7 +50,7 @@ impl Connection {
         })
     }
 
-    /// Talks with it until it goes, or is listened to no longer.
+    /// Exchanges messages until the page disconnects or violates a limit.
     pub async fn talk(self, socket: WebSocket) {
         self.outbox.post(Outgoing::Text(self.served.requests.about()));
         let patience = self.served.limits.patience;
@@ -66,14 +66,14 @@ impl Connection {
         }
     }
 
-    /// Sends what there is for the page; gives why it is no longer sent anything, if it is there.
+    /// Sends messages to the page. Returns the reason for closing the connection, or `None` if the page has gone.
     async fn write(&self, out: &mut SplitSink<WebSocket, Message>) -> Option<&'static str> {
         let (outbox, limits) = (&self.outbox, &self.served.limits);
         let mut pinged = Instant::now();
         loop {
             while let Some(message) = outbox.take() {
                 let (bytes, message) = framed(message);
-                // Meanwhile it cannot say anything.
+                // A page does not send while it receives a long message, so its silence does not count.
                 self.sending.store(true, Ordering::Relaxed);
                 let sent = timeout(limits.patience_for(bytes), out.send(message)).await;
                 self.sending.store(false, Ordering::Relaxed);
@@ -88,7 +88,7 @@ impl Connection {
             if seen.is_some_and(|until| until <= Instant::now()) {
                 return Some("an image was not acknowledged");
             }
-            // Whether it is still there: a browser answers by itself, also one that looks on and says nothing.
+            // Browsers answer pings by themselves, also for idle pages.
             if pinged.elapsed() >= limits.idle {
                 pinged = Instant::now();
                 if !matches!(timeout(limits.patience, out.send(Message::Ping(Default::default()))).await, Ok(Ok(()))) {
@@ -99,7 +99,7 @@ impl Connection {
         }
     }
 
-    /// Takes what the page says; gives why it is listened to no longer, if it is there.
+    /// Handles messages of the page. Returns the reason for closing the connection, or `None` if the page has gone.
     async fn read(&self, heard: &mut SplitStream<WebSocket>) -> Option<String> {
         let limits = &self.served.limits;
         let (mut allowed, mut last) = (limits.burst, Instant::now());
@@ -156,7 +156,7 @@ impl Connection {
             ClientMessage::Share { share } => requests.set_share(share),
             ClientMessage::Rest {} => requests.rest(client),
             ClientMessage::Video(video) => match served.video_jobs.clone() {
-                // It looks for what is installed.
+                // Starting a video blocks, since it looks for installed programs.
                 Some(video_jobs) => {
                     let outbox = outbox.clone();
                     tokio::task::spawn_blocking(move || {
@@ -177,7 +177,7 @@ impl Connection {
     }
 }
 
-/// A message as it is sent, and how many bytes it has.
+/// The WebSocket message and its length in bytes.
 fn framed(message: Outgoing) -> (usize, Message) {
     match message {
         Outgoing::Text(text) => (text.len(), Message::Text(text.into())),
@@ -185,21 +185,20 @@ fn framed(message: Outgoing) -> (usize, Message) {
     }
 }
 
-/// When there is something to see to, though nothing is to be sent: the page is asked whether it is there, or must have seen a
-/// picture.
+/// Next time of a ping, or of the time-out of an unacknowledged render.
 fn next(pinged: Instant, seen: Option<Instant>, limits: &Limits) -> Instant {
     let ping = pinged + limits.idle;
     seen.map_or(ping, |seen| seen.min(ping))
 }
 
-/// As much of a reason as a close frame has room for.
+/// Shortens a reason to fit in a close frame.
 fn shortened(mut reason: String) -> String {
     let room = (0..=REASON).rev().find(|at| reason.is_char_boundary(*at)).unwrap_or(0);
     reason.truncate(room);
     reason
 }
 
-/// A photograph as the page wants it.
+/// The image as a JPEG message.
 async fn photograph(number: usize, served: &Arc<Served>) -> Outgoing {
     let Ok(_permit) = served.readers.acquire().await else { return sorry("the image cannot be read") };
     let (photos, background) = (served.photos.clone(), served.background);
@@ -226,7 +225,7 @@ mod tests {
     use serde_json::{Value, json};
     use std::time::Duration;
 
-    /// A page of a scene without photographs, as it is beside its connection.
+    /// A page without a socket, of a scene without images.
     fn page(video_jobs: impl FnOnce(&Arc<Requests>) -> Option<Arc<VideoJobs>>) -> Connection {
         let requests = Arc::new(Requests::default());
         let video_jobs = video_jobs(&requests);
@@ -253,7 +252,7 @@ mod tests {
         page.answer(ClientMessage::read(&message.to_string()).unwrap());
     }
 
-    /// Why the page does not get what it has asked for; nothing if it was not told.
+    /// The text of the error that was sent, if any.
     fn apology(page: &Connection) -> Option<String> {
         match page.outbox.take()? {
             Outgoing::Text(text) => {
@@ -265,7 +264,7 @@ mod tests {
         }
     }
 
-    /// The same, of what is found out beside.
+    /// Like [`apology`], for answers of background tasks.
     async fn later(page: &Connection) -> String {
         for _ in 0..2000 {
             if let Some(what) = apology(page) {
@@ -277,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_for_is_seen_to() {
+    fn answer_handles_each_message() {
         let page = page(|_| None);
         let requests = &page.served.requests;
         page.answer(ClientMessage::View { id: 1, view: view() });
@@ -298,7 +297,7 @@ mod tests {
             json!({ "ask": "video", "path": { "render_width": 8, "render_height": 8, "seconds": 1, "fps": 1 } }),
         );
         assert_eq!(apology(&page).unwrap(), "videos can be rendered only after training");
-        // Four pictures to keep may wait.
+        // Four saves may wait.
         let refused = (1..).find_map(|count| {
             page.answer(ClientMessage::Save { view: view() });
             apology(&page).map(|what| (count, what))
@@ -311,9 +310,9 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn photographs_are_read_one_after_the_other() {
+    async fn image_requests_are_read_one_at_a_time() {
         let page = page(|_| None);
-        // Others are being read for other pages.
+        // Reads for other pages hold all permits.
         let others = page.served.readers.acquire().await.unwrap();
         ask(&page, json!({ "ask": "photograph", "number": 0 }));
         tokio::task::yield_now().await;
@@ -327,7 +326,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn photographs_are_for_pages_that_take_them() {
+    async fn image_requests_with_full_outbox_are_refused() {
         let page = page(|_| None);
         let limit = page.served.limits.files;
         for _ in 0..limit {
@@ -341,13 +340,13 @@ mod tests {
             (0..files + 1).for_each(|_| page.outbox.post(Outgoing::Bytes(vec![])));
         };
         asked("not available").await;
-        // One more, and two.
+        // Above the limit by one and by two.
         asked("too many images are waiting: try again when one has arrived").await;
         asked("too many images are waiting: try again when one has arrived").await;
     }
 
     #[tokio::test]
-    async fn why_no_video_is_made_is_said() {
+    async fn video_errors_reach_the_page() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let run = Arc::new(Run { folder: file.path().to_owned(), config: run_config() });
         let page = page(|requests| Some(Arc::new(VideoJobs::new(run, None, requests.clone()))));
@@ -361,7 +360,7 @@ mod tests {
         ask(&page, json!({ "ask": "video", "path": path }));
         let expected = "36000 frames of this size are too many (at most 4096): lower the seconds, `fps` or size";
         assert_eq!(later(&page).await, expected);
-        // One of another page, which this one may end, too.
+        // Another page's video, which this page may cancel too.
         page.served.video_jobs.as_ref().unwrap().claim().unwrap();
         ask(&page, video.clone());
         assert_eq!(later(&page).await, "`video`: another video is rendering: wait for it or cancel it");
@@ -371,13 +370,13 @@ mod tests {
     }
 
     #[test]
-    fn binary_messages_have_their_stated_length() {
+    fn framed_messages_have_their_stated_length() {
         assert_eq!(framed(Outgoing::Text("\u{e4}x".to_owned())), (3, Message::Text("\u{e4}x".into())));
         assert_eq!(framed(Outgoing::Bytes(vec![7; 5])), (5, Message::Binary(vec![7; 5].into())));
     }
 
     #[test]
-    fn what_is_first_is_seen_to_first() {
+    fn next_deadline_is_the_earlier_one() {
         let (limits, start) = (Limits::USUAL, Instant::now());
         let after = |seconds: u64| start + Duration::from_secs(seconds);
         let next = |seen: Option<u64>| next(start, seen.map(after), &limits);
@@ -385,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn close_reasons_fit_and_end_with_a_letter() {
+    fn close_reason_is_cut_at_a_character() {
         assert_eq!(shortened("not taken".to_owned()), "not taken");
         assert_eq!(shortened("x".repeat(500)), "x".repeat(REASON));
         assert_eq!(shortened("\u{e4}".repeat(100)), "\u{e4}".repeat(REASON / 2));

@@ -1,4 +1,4 @@
-//! What a page asks for and what it is told.
+//! Messages between the viewer and its pages.
 
 use raygrad::nerf::dataset::{Photo, Split};
 use raygrad::nerf::glam::{DAffine3, DMat3, DQuat, DVec3};
@@ -9,43 +9,43 @@ use serde_json::Value;
 
 use crate::render::shown::Show;
 
-/// Longest side of a picture.
+/// Longest side of a render in pixels.
 pub const LARGEST: u32 = 4096;
-/// Most pixels of a picture.
+/// Most pixels of a render.
 const MOST_PIXELS: u32 = 1 << 22;
-/// Most pixels of all pictures of a video, which are kept as files until it is made.
+/// Most pixels of all frames of a video, which are stored as files until the video is complete.
 const MOST_OF_A_FILM: u64 = 1 << 34;
-/// Coordinates beyond this, in scene units, are of nothing that can be seen.
+/// Largest coordinate in scene units.
 const FARTHEST: f64 = 1e9;
 
-/// What a page says: text, one JSON object a message.
+/// A message from a page: text with one JSON object.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(tag = "ask", rename_all = "kebab-case", deny_unknown_fields, expecting = "a message")]
 pub enum ClientMessage {
-    /// Pictures of this, until something else is asked for. `id` comes back with them.
+    /// Requests renders of this view until the next request. Each render has this `id`.
     View { id: u32, view: View },
-    /// Nothing is looked at for now.
+    /// Requests no renders for now.
     Rest {},
-    /// Another may be sent: the picture that was asked for by `id` has arrived.
+    /// Acknowledges a render of the request `id`, so that the next one may be sent.
     Seen { id: u32 },
-    /// The picture of this in full, as a PNG file.
+    /// Requests the full-size render as a PNG file.
     Save { view: View },
-    /// A photograph.
+    /// Requests an image.
     Photograph { number: usize },
-    /// Training goes on or waits.
+    /// Pauses or resumes training.
     Pause { pause: bool },
-    /// Training ends here, and what it has found is saved.
+    /// Stops training and saves the model.
     Stop {},
-    /// The share of time that training leaves to pictures, 0 to .9.
+    /// Fraction of time for renders during training, 0 to 0.9.
     Share { share: f64 },
-    /// A video.
+    /// Requests a video.
     Video(VideoRequest),
-    /// The video that is being made is not wanted.
+    /// Cancels the video.
     EndVideo {},
 }
 
 impl ClientMessage {
-    /// Reads a message.
+    /// Parses a message.
     pub fn read(text: &str) -> Result<ClientMessage, String> {
         let ask: ClientMessage =
             serde_json::from_str(text).map_err(|e| e.to_string().replace(char::is_control, " "))?;
@@ -61,18 +61,18 @@ impl ClientMessage {
     }
 }
 
-/// A video along a camera path, of the run's model as a whole.
+/// A video along a camera path, rendered with the run's model.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VideoRequest {
-    /// As `raygrad render --path` reads it, which says what else is wrong with it.
+    /// A path for `raygrad render --path`, which validates the rest of it.
     pub path: Value,
     #[serde(default)]
     pub show: Show,
-    /// What lies behind the scene; as in training if nothing is said.
+    /// Background; the background of training if `None`.
     #[serde(default)]
     pub background: Option<[u8; 3]>,
-    /// How much that hardly shows is left out; as in training if nothing is said.
+    /// Skipping; as in training if `None`.
     #[serde(default)]
     pub skip: Option<Skip>,
 }
@@ -85,7 +85,7 @@ impl VideoRequest {
         self.frames().map(drop)
     }
 
-    /// Whether there is room for all of its frames: a page may well ask for more, and is told.
+    /// Fails if the video has too many pixels. A page may request any size.
     pub fn fits(&self) -> Result<(), String> {
         let (pixels, frames) = (self.pixels()?, self.frames()?);
         if pixels * frames > MOST_OF_A_FILM as f64 {
@@ -114,7 +114,7 @@ impl VideoRequest {
     }
 }
 
-/// What is to be seen. Places are in scene units.
+/// A view of the scene. Coordinates are in scene units.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct View {
@@ -123,35 +123,35 @@ pub struct View {
     pub size: [u32; 2],
     #[serde(default)]
     pub show: Show,
-    /// Whether colours are seen as how far they are from those of the nearest photograph, from where that was taken.
+    /// True to show the error of colours against the nearest image, from its camera.
     #[serde(default)]
     pub compared: bool,
-    /// What lies behind the scene; as in training if nothing is said.
+    /// Background; the background of training if `None`.
     #[serde(default)]
     pub background: Option<[u8; 3]>,
-    /// The box beyond which nothing is shown, lower and upper corner.
+    /// Visible box: lower and upper corner.
     #[serde(default)]
     pub crop: Option<[[f64; 3]; 2]>,
-    /// How much that hardly shows is left out; as in training if nothing is said.
+    /// Skipping; as in training if `None`.
     #[serde(default)]
     pub skip: Option<Skip>,
-    /// The step of the checkpoint that is looked at; none while it is trained.
+    /// Step of the displayed checkpoint; `None` during training.
     #[serde(default)]
     pub checkpoint: Option<u64>,
 }
 
-/// Where a picture is seen from.
+/// Camera of a view.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Eye {
-    /// A pinhole.
+    /// A pinhole camera.
     Free {
-        /// Camera to world, three rows of four.
+        /// Camera-to-world matrix, three rows of four.
         pose: [[f64; 4]; 3],
         /// Vertical field of view in degrees.
         fov: f64,
     },
-    /// Where the photograph of this number was taken, by its camera.
+    /// The camera of the image with this number.
     Photograph(usize),
 }
 
@@ -183,9 +183,9 @@ impl View {
         Ok(())
     }
 
-    /// The camera of a view that is free.
+    /// The camera of a free view.
     pub fn camera(pose: &[[f64; 4]; 3], fov: f64, [width, height]: [usize; 2]) -> Camera {
-        // Exactly a rotation, whatever was lost in a few digits.
+        // Makes the matrix an exact rotation, since the page sends rounded numbers.
         let turn = DQuat::from_mat3(&rotation(pose)).normalize();
         let pose = DAffine3 { matrix3: DMat3::from_quat(turn), translation: DVec3::from(pose.map(|row| row[3])) };
         let focal = 0.5 * height as f64 / (0.5 * fov.to_radians()).tan();
@@ -205,46 +205,46 @@ pub fn rows(pose: &DAffine3) -> [[f64; 4]; 3] {
     })
 }
 
-/// What a page is told of the scene, once.
+/// Description of the scene, sent once to each page.
 #[derive(Debug, Clone, Serialize)]
 pub struct About {
     pub title: String,
     #[serde(flatten)]
     pub first: FirstView,
-    /// Width and height of the photographs.
+    /// Width and height of the images.
     pub size: [usize; 2],
     pub background: [f32; 3],
     #[serde(flatten)]
     pub taken: Taken,
-    /// Places of the scene that were found with the cameras, with their colours.
+    /// Sparse points of the capture with their colours.
     pub points: Vec<([f32; 3], [u8; 3])>,
-    /// Whether the scene is being trained.
+    /// True during training.
     pub training: bool,
-    /// The steps of which there are checkpoints to look at.
+    /// Steps of the available checkpoints.
     pub checkpoints: Vec<u64>,
 }
 
-/// Where photographs were taken, which training may learn more of.
+/// Cameras of the images, which pose refinement may change.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Taken {
-    /// From the scene to the capture's own coordinates, three rows of four.
+    /// From scene coordinates to the capture's coordinates, three rows of four.
     pub to_capture: [[f64; 4]; 3],
     pub photographs: Vec<AboutPhotograph>,
 }
 
-/// Where a scene is looked at from first, and where it is.
+/// Initial view, and bounds of the scene.
 #[derive(Debug, Clone, Serialize)]
 pub struct FirstView {
     pub pose: [[f64; 4]; 3],
     /// Vertical field of view in degrees.
     pub fov: f64,
-    /// Width through height of the picture that this is of.
+    /// Aspect ratio of the view: width over height.
     pub proportion: f64,
-    /// The corners of the scene's box, in scene units.
+    /// The corners of the scene box, in scene units.
     pub bounds: [[f64; 3]; 2],
 }
 
-/// What a page is told of a photograph.
+/// An image and its camera.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct AboutPhotograph {
     pub name: String,
@@ -252,76 +252,77 @@ pub struct AboutPhotograph {
     pub pose: [[f64; 4]; 3],
     /// Vertical field of view in degrees.
     pub fov: f64,
-    /// Where its optical axis is, 0 to 1 from the left and from the top.
+    /// Principal point, 0 to 1 from the left and from the top.
     pub centre: [f64; 2],
     pub size: [usize; 2],
 }
 
-/// What a page is told: of these, text.
+/// A text message to a page.
 #[derive(Debug, Clone, Serialize)]
 #[serde(tag = "tell", rename_all = "kebab-case")]
 pub enum ServerMessage {
     About(Box<About>),
-    /// How training goes.
+    /// State of training.
     Training(Value),
-    /// Where photographs were taken, as it is known by now.
+    /// Current cameras of the images.
     Taken(Taken),
-    /// How a video is getting on, and in which file.
+    /// Progress of a video, and its file.
     Video {
         file: String,
         words: String,
         ended: bool,
     },
-    /// What was asked for cannot be had.
+    /// A request failed.
     Sorry {
         what: String,
     },
 }
 
-/// What stands before a file in a message of bytes: how long this is, in four bytes, the least first, and this.
+/// Header of a binary message. The message starts with the header's length in four bytes, little-endian. The header and
+/// the file follow.
 #[derive(Debug, Clone, Serialize)]
 #[serde(tag = "file", rename_all = "kebab-case")]
 pub enum File {
-    /// A JPEG of what was asked for by `id`.
+    /// A JPEG render for the request `id`.
     Picture {
         id: u32,
         #[serde(flatten)]
         made: Made,
     },
-    /// A PNG to keep.
+    /// A PNG file to download.
     Save { name: String },
-    /// A JPEG of the photograph of this number.
+    /// A JPEG of the image with this number.
     Photograph { number: usize },
 }
 
-/// How a picture was made.
+/// Properties of a render.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Made {
-    /// How many times its size was halved; 0 is the whole.
+    /// Number of times that the size was halved; 0 for full size.
     pub halvings: u32,
-    /// How long it took.
+    /// Render time in milliseconds.
     pub milliseconds: f64,
-    /// The photograph that it is compared with, if it is; their PSNR in dB at this size, of whole pictures and none where evaluations
-    /// would leave something out; and whether that is an evaluation's own.
+    /// The compared image, if any. The PSNR in dB is `None` for coarse renders, and if evaluation masks or corrects the
+    /// image. The flag is true if `raygrad eval` compares at this size.
     pub compared: Option<(usize, Option<f64>, bool)>,
-    /// The step of training.
+    /// Training step.
     pub step: u64,
 }
 
 impl File {
-    /// The message that has these bytes.
+    /// The binary message with this file.
     pub fn message(&self, bytes: &[u8]) -> Vec<u8> {
         let head = serde_json::to_vec(self).unwrap_or_default();
         [&(head.len() as u32).to_le_bytes(), &head[..], bytes].concat()
     }
 }
 
-/// As text.
+/// The message as JSON text.
 pub fn text(tell: &ServerMessage) -> String {
     serde_json::to_string(tell).unwrap_or_default()
 }
 
-/// A photograph at this size, over a background.
+/// The image at this size, over a background.
 pub fn at_size(photo: &Photo, [width, height]: [usize; 2], background: [f32; 3]) -> Image {
     let same = [photo.width, photo.height] == [width, height];
     if same { photo.over(background) } else { photo.resized([width, height]).over(background) }

@@ -1,4 +1,4 @@
-//! `raygrad view`: a window on the scene, in a browser.
+//! `raygrad view`: the browser viewer.
 
 mod access;
 mod cache;
@@ -36,10 +36,10 @@ use video_jobs::VideoJobs;
 pub use server::Listener;
 pub use training_viewer::TrainingViewer;
 
-/// What moves cameras in pages.
+/// The camera controls, shared by all pages.
 pub const CAMERA: &str = include_str!("page/camera.js");
 
-/// The address of this machine that others cannot reach.
+/// Loopback address, which other machines cannot reach.
 const HOST: &str = "127.0.0.1";
 
 /// Open a run in the browser viewer
@@ -63,7 +63,7 @@ pub struct Args {
     scene: Option<Scene>,
 }
 
-/// Where pages are served.
+/// Address and port of the viewer.
 #[derive(Debug, Clone, clap::Args)]
 pub struct PlaceArgs {
     /// Address to serve on
@@ -78,21 +78,22 @@ pub struct PlaceArgs {
 }
 
 impl PlaceArgs {
-    /// Whether somebody has said something.
+    /// Returns true if an option differs from its default.
     pub fn are_given(&self) -> bool {
         self.host != HOST || self.port != 0
     }
 
-    /// Takes the port.
+    /// Binds the port.
     ///
     /// # Errors
-    /// If the host is not known or the port is taken.
+    ///
+    /// Fails if the host is unknown or the port is in use.
     pub fn listen(&self) -> Result<Listener> {
         Listener::bind(&self.host, self.port)
     }
 }
 
-/// Serves until it is ended.
+/// Serves the viewer until it is interrupted.
 pub fn run(args: &Args) -> Result<()> {
     let run = Arc::new(Run::open(&args.run)?);
     let model = Arc::new(run.model()?);
@@ -113,7 +114,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
 }
 
-/// The photographs of a run, which it can be looked at without.
+/// The images of a run. The viewer also works without them.
 fn photos(run: &Run, scene: Option<&Scene>) -> Option<Arc<PhotoCache>> {
     match PhotoCache::open(run, scene) {
         Ok(photos) => Some(Arc::new(photos)),
@@ -124,7 +125,7 @@ fn photos(run: &Run, scene: Option<&Scene>) -> Option<Arc<PhotoCache>> {
     }
 }
 
-/// Where a scene is looked at from first.
+/// The initial view of a scene.
 pub fn first_view(run: &Run) -> FirstView {
     let (view, extent) = (&run.config.viewpoint, &run.config.scene_box);
     let camera = &view.orbit(extent, 1)[0];
@@ -136,7 +137,7 @@ pub fn first_view(run: &Run) -> FirstView {
     }
 }
 
-/// What pages are told of a scene; `checkpoints` are those that can be looked at, if it is not being trained.
+/// The description of a scene for pages. `checkpoints` lists the available ones, if the scene is not being trained.
 fn about(run: &Run, model: &Model<f32>, photos: Option<&PhotoCache>, checkpoints: Option<Vec<u64>>) -> String {
     let view = &run.config.viewpoint;
     let about = About {
@@ -152,9 +153,9 @@ fn about(run: &Run, model: &Model<f32>, photos: Option<&PhotoCache>, checkpoints
     messages::text(&ServerMessage::About(Box::new(about)))
 }
 
-/// Where photographs were taken.
+/// The cameras of the images.
 fn taken(run: &Run, model: &Model<f32>, photos: Option<&PhotoCache>) -> Taken {
-    // As cameras of files are taken to where the model has them: where they are given, and from there by what it has learned.
+    // File coordinates map to the scene by the scene transform, then by the learned transform of all cameras.
     let learned =
         model.camera_optimizer.as_ref().and_then(|refine| refine.transform(&model.params)).unwrap_or_default();
     Taken {
@@ -163,12 +164,12 @@ fn taken(run: &Run, model: &Model<f32>, photos: Option<&PhotoCache>) -> Taken {
     }
 }
 
-/// From the scene to a capture that was placed in it and has moved since as a whole.
+/// Maps scene coordinates to capture coordinates: the inverse of the learned transform, then of the scene transform.
 fn to_capture(placement: &SceneTransform, learned: &SceneTransform) -> DAffine3 {
     inverse(placement) * inverse(learned)
 }
 
-/// From the scene to what was placed in it.
+/// The inverse of a scene transform.
 fn inverse(placement: &SceneTransform) -> DAffine3 {
     let turn = placement.rotation.transpose() * DMat3::from_diagonal(DVec3::splat(placement.scale.recip()));
     DAffine3 { matrix3: turn, translation: placement.origin }
@@ -179,7 +180,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sweep_finds_moved_folders() {
+    fn to_capture_inverts_both_transforms() {
         let placement =
             SceneTransform { rotation: DMat3::from_rotation_z(0.7), scale: 2.5, origin: DVec3::new(1.0, -2.0, 0.5) };
         let learned =

@@ -1,4 +1,4 @@
-//! Models to look at beside the one that a run ended with: as a checkpoint has it, and with more or less left out.
+//! Models of checkpoints, and models with other skipping.
 
 use std::sync::Arc;
 
@@ -11,10 +11,10 @@ use super::requests::Requests;
 use crate::checkpoint;
 use crate::run::Run;
 
-/// Models that are kept in memory.
+/// Number of models in memory.
 const KEPT: usize = 3;
 
-/// Which model is looked at: of which step, if it is a checkpoint's, and what it leaves out, if that is not as in training.
+/// Identifies a model: the step of its checkpoint, and its skipping, if it differs from training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct ModelKey {
     pub checkpoint: Option<u64>,
@@ -39,7 +39,7 @@ impl ModelCache {
         ModelCache { run, model, others: Cache::new(KEPT) }
     }
 
-    /// A model; wakes who waits at the requests when one that was not here has come.
+    /// Returns a model. Notifies `requests` when a model that was not cached is ready.
     pub fn get(&self, which: ModelKey, requests: &Arc<Requests>) -> Cached<Model<f32>> {
         if which == ModelKey::default() {
             return Cached::Here(self.model.clone());

@@ -1,4 +1,4 @@
-//! The photographs of a run, one at a time.
+//! The images of a run, loaded on demand.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -16,42 +16,43 @@ use crate::photographs::{check_trained, present};
 use crate::run::Run;
 use crate::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
 
-/// Photographs that are kept in memory.
+/// Number of images in memory.
 const KEPT: usize = 4;
-/// Longest side that they are kept at.
+/// Longest side of an image in memory, in pixels.
 const LONGEST: usize = 1600;
-/// Most points that a page is told of.
+/// Most points that a page gets.
 const MOST_POINTS: usize = 4000;
 
-/// The photographs of all splits, by number.
+/// The images of all splits, by number.
 pub struct PhotoCache {
     capture: Capture,
     scene: Scene,
-    /// What the sides of photographs are divided by where they are trained on and evaluated.
+    /// Downscale factor of training and evaluation.
     downscale: usize,
     entries: Vec<Entry>,
-    /// The best points of the capture, in the scene.
+    /// The best points of the capture, in scene coordinates.
     points: Vec<(DVec3, [u8; 3])>,
     kept: Cache<usize, Photo>,
-    /// The photographs of a split of a scene that is built in, which are made together, and their width.
+    /// The images of a split of a built-in scene, which are rendered together.
     made: Mutex<Option<(Split, Vec<Frame>)>>,
     width: usize,
 }
 
 struct Entry {
     split: Split,
-    /// Which of its split it is.
+    /// Index in the split.
     number: usize,
     view: View,
-    /// The camera as the files have it, in the scene.
+    /// The camera from the files, in scene coordinates.
     given: Camera,
 }
 
 impl PhotoCache {
-    /// Those that a run was trained on and those that were held out. No image is read.
+    /// Opens the training and held-out images of a run. Reads no pixels.
     ///
     /// # Errors
-    /// If the capture cannot be read, or those to train on are others.
+    ///
+    /// Fails if the capture cannot be read or the training images differ from those of the run.
     pub fn open(run: &Run, scene: Option<&Scene>) -> Result<Self> {
         let scene = run.scene(scene)?.clone();
         let capture = builtin::capture(&scene, None, None)?;
@@ -59,9 +60,9 @@ impl PhotoCache {
         let placement = run.config.scene_box.transform;
         let mut entries = vec![];
         for split in Split::ALL {
-            // A capture need not have all of them.
+            // A capture may lack splits.
             let Ok(views) = present(&capture, split) else { continue };
-            // Where there are none to validate with, those are the test views.
+            // Without a validation split, its views are the test views.
             let names = |views: &[&View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
             let are_tests = |tests: Vec<&View>| names(&tests) == names(&views);
             if split == Split::Val && present(&capture, Split::Test).is_ok_and(are_tests) {
@@ -81,12 +82,12 @@ impl PhotoCache {
         Ok(PhotoCache { capture, scene, downscale, entries, points, kept, made, width })
     }
 
-    /// Whether there is a photograph of this number.
+    /// Returns true if an image has this number.
     pub fn has(&self, number: usize) -> bool {
         number < self.entries.len()
     }
 
-    /// The camera of a photograph, where a model has it.
+    /// The camera of an image, with pose refinement.
     pub fn camera(&self, number: usize, model: &Model<f32>) -> Option<Camera> {
         let Entry { split, number, given, .. } = self.entries.get(number)?;
         Some(match split {
@@ -95,7 +96,7 @@ impl PhotoCache {
         })
     }
 
-    /// All of them.
+    /// All cameras.
     fn cameras(&self, model: &Model<f32>) -> Vec<Camera> {
         let given: Vec<Camera> = self.entries.iter().map(|entry| entry.given.clone()).collect();
         let camera = |(entry, other): (&Entry, Camera)| match entry.split {
@@ -105,7 +106,8 @@ impl PhotoCache {
         self.entries.iter().zip(model.other_cameras(&given)).map(camera).collect()
     }
 
-    /// Whether evaluations compare a photograph at this size: as it is trained on, from the files themselves.
+    /// Returns true if evaluation compares an image at this size and with the same pixels. Excludes images above the
+    /// size in memory, and downscaled built-in ones.
     pub fn is_evaluated_at(&self, number: usize, size: [usize; 2]) -> bool {
         let is_averaged = self.downscale == 1 || matches!(self.scene, Scene::Folder(_));
         self.entries.get(number).is_some_and(|Entry { given, .. }| {
@@ -115,13 +117,14 @@ impl PhotoCache {
         })
     }
 
-    /// Whether evaluations see a photograph otherwise than a page: without what its mask covers, or with what was learned of it alone.
+    /// Returns true if evaluation treats an image differently: with a mask, or with the image's own appearance
+    /// embedding.
     pub fn is_special(&self, number: usize, model: &Model<f32>) -> bool {
         let own = |entry: &Entry| Appearance::of(model, entry.split, false) == Appearance::Own;
         self.entries.get(number).is_some_and(|entry| entry.view.mask.is_some() || own(entry))
     }
 
-    /// The photograph that was taken nearest to where a camera is, looking the way it looks.
+    /// The image whose camera is nearest in position and direction.
     pub fn nearest(&self, camera: &Camera, model: &Model<f32>) -> Option<usize> {
         let middle = 0.5 * (model.scene_box.bounds[0] + model.scene_box.bounds[1]);
         let reach = camera.pose.translation.distance(middle).max(1e-6);
@@ -133,15 +136,16 @@ impl PhotoCache {
         apart.map(|(number, _)| number)
     }
 
-    /// A photograph, no larger than a page shows it.
+    /// Loads an image, at most as large as pages show it.
     ///
     /// # Errors
-    /// If there is none of this number, or it cannot be read.
+    ///
+    /// Fails if no image has this number or it cannot be read.
     pub fn photo(&self, number: usize) -> Result<Arc<Photo>> {
         self.kept.get_now(number, || self.read(number))
     }
 
-    /// The same, read beside all else; wakes who waits at the requests when it has come.
+    /// Like [`photo`](Self::photo), in the background. Notifies `requests` when the image is ready.
     pub fn fetch(self: &Arc<Self>, number: usize, requests: &Arc<Requests>) -> Cached<Photo> {
         let (photos, requests) = (self.clone(), requests.clone());
         self.kept.get(number, move || photos.read(number), move || requests.wake())
@@ -157,7 +161,7 @@ impl PhotoCache {
         Ok(if photo.width.max(photo.height) > LONGEST { shrunk(&photo) } else { photo })
     }
 
-    /// A photograph of a scene that is built in.
+    /// An image of a built-in scene.
     fn made(&self, scene: &Scene, entry: &Entry) -> Result<Photo> {
         let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
         let frames = match made.take_if(|(split, _)| *split == entry.split) {
@@ -172,7 +176,7 @@ impl PhotoCache {
         photo.ok_or_else(|| Error::setting("image", format!("there is no image {}", entry.number)))
     }
 
-    /// What a page is told of them.
+    /// The description of the images for pages.
     pub fn about(&self, model: &Model<f32>) -> Vec<AboutPhotograph> {
         let about = |(entry, camera): (&Entry, Camera)| AboutPhotograph {
             name: entry.view.name.clone(),
@@ -185,9 +189,9 @@ impl PhotoCache {
         self.entries.iter().zip(self.cameras(model)).map(about).collect()
     }
 
-    /// Places of the scene and their colours: the best of them, if there are many.
+    /// Points of the scene with their colours, limited to the best ones.
     pub fn points(&self, model: &Model<f32>) -> Vec<([f32; 3], [u8; 3])> {
-        // With the cameras, if these are found to have been elsewhere.
+        // Points move with the cameras if all cameras have a learned transform.
         let learned =
             model.camera_optimizer.as_ref().and_then(|refine| refine.transform(&model.params)).unwrap_or_default();
         let place = |(point, color): &(DVec3, [u8; 3])| (learned.point(*point).as_vec3().to_array(), *color);
@@ -195,15 +199,14 @@ impl PhotoCache {
     }
 }
 
-/// The points that most photographs show, and of those that as many show the ones that are known best; so many that a page has
-/// room for them.
+/// The points in most images. Among equals, those with the least error come first. Limited to the number for a page.
 fn best(points: &[Point]) -> impl Iterator<Item = &Point> {
     let mut points: Vec<&Point> = points.iter().collect();
     points.sort_by(|a, b| b.views.cmp(&a.views).then(a.error.total_cmp(&b.error)));
     points.into_iter().take(MOST_POINTS)
 }
 
-/// A photograph whose longest side is as long as is kept.
+/// The image, downscaled to the longest side in memory.
 fn shrunk(photo: &Photo) -> Photo {
     let share = LONGEST as f64 / photo.width.max(photo.height) as f64;
     let side = |side: usize| ((side as f64 * share).round() as usize).max(1);
@@ -219,7 +222,7 @@ mod tests {
     use raygrad::nerf::{Config, Image, Preset, SceneBox};
     use std::path::PathBuf;
 
-    /// Photographs from these places, looking down, of these splits.
+    /// Images of these splits at these positions, looking down.
     fn photos(scene: Scene, places: &[(Split, DVec3)]) -> PhotoCache {
         let capture = builtin::capture(&Scene::Landscape, None, None).unwrap();
         let mut numbers = [0; 3];
@@ -243,7 +246,7 @@ mod tests {
     const UNIT: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
 
     #[test]
-    fn trained_images_stand_where_they_were_found() {
+    fn camera_of_trained_image_is_refined() {
         let at = |x: f64, y: f64| DVec3::new(x, y, 3.0);
         let places = [
             (Split::Train, at(0.0, 1.0)),
@@ -267,17 +270,18 @@ mod tests {
     }
 
     #[test]
-    fn nearest_image_is_near_and_looks_alike() {
+    fn nearest_uses_position_and_direction() {
         let mut photos = photos(Scene::Embedded, &[(Split::Train, DVec3::new(0.0, 0.0, 5.0)); 3]);
         let model = model([DVec3::ZERO, DVec3::splat(2.0)], &[], false);
-        // Two away and turned by a right angle; six away, held alike; the same place, turned round.
+        // Two units away and turned by a right angle; six away with equal direction; at the same position, turned
+        // round.
         photos.entries[0].given.pose = DAffine3::from_rotation_x(1.5) * DAffine3::from_translation(DVec3::ZERO);
         photos.entries[0].given.pose.translation = DVec3::new(2.0, 0.0, 7.0);
         photos.entries[1].given.pose.translation = DVec3::new(6.0, 0.0, 7.0);
         photos.entries[2].given.pose = DAffine3::from_rotation_x(3.1);
         photos.entries[2].given.pose.translation = DVec3::new(0.0, 0.0, 7.0);
         let camera = Camera::from_angle(4, 3, 0.8, DAffine3::from_translation(DVec3::new(0.0, 0.0, 7.0)));
-        // By the way from the middle, (1, 1, 1), of 6.16: .32 + 1.36, .97 + 0, 0 + 2.
+        // Relative to the distance of 6.16 from the centre (1, 1, 1): .32 + 1.36, .97 + 0, 0 + 2.
         assert_eq!(photos.nearest(&camera, &model), Some(1));
         photos.entries[1].given.pose.translation.x = 11.0;
         assert_eq!(photos.nearest(&camera, &model), Some(0), "1.78");
@@ -286,19 +290,19 @@ mod tests {
     }
 
     #[test]
-    fn viewer_psnr_matches_eval() {
+    fn viewer_psnr_equals_eval() {
         let mut photos =
             photos(Scene::Folder(PathBuf::new()), &[(Split::Train, DVec3::ZERO), (Split::Test, DVec3::ONE)]);
         let model = model(UNIT, &[], false);
         assert!(!photos.is_special(0, &model) && !photos.is_special(7, &model));
         photos.entries[0].view.mask = Some(PathBuf::from("mask.png"));
         assert!(photos.is_special(0, &model) && !photos.is_special(1, &model));
-        // Of the size that is trained on.
+        // The size of training.
         let at = |photos: &PhotoCache, size: [usize; 2]| photos.is_evaluated_at(1, size);
         assert_eq!([[40, 30], [20, 15], [39, 30], [40, 29]].map(|size| at(&photos, size)), [true, false, false, false]);
         photos.downscale = 4;
         assert_eq!([[40, 30], [10, 8], [10, 7]].map(|size| at(&photos, size)), [false, true, false]);
-        // Those that are built in are not made smaller, but made so.
+        // Images of built-in scenes are rendered at the size, not downscaled to it.
         photos.scene = Scene::Landscape;
         assert!(!at(&photos, [10, 8]) && !photos.is_evaluated_at(2, [40, 30]));
         (photos.downscale, photos.entries[1].given.width) = (1, LONGEST + 1);
@@ -306,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn built_in_images_are_rendered_by_split_and_number() {
+    fn built_in_images_match_split_and_number() {
         let places = [(Split::Train, DVec3::ZERO), (Split::Test, DVec3::ZERO), (Split::Test, DVec3::ZERO)];
         let photos = photos(Scene::Landscape, &places);
         let tests = landscape(Split::Test, 16).frames;
@@ -317,14 +321,14 @@ mod tests {
     }
 
     #[test]
-    fn the_points_that_are_known_best_come_first() {
+    fn points_with_most_views_come_first() {
         let of = |views: u32, error: f64| Point { position: DVec3::ZERO, color: [0; 3], error, views };
         let mut points = vec![of(2, 0.1), of(5, 0.9), of(5, 0.2), of(3, 0.0)];
         let order = best(&points).map(|point| (point.views, point.error)).collect::<Vec<_>>();
         assert_eq!(order, [(5, 0.2), (5, 0.9), (3, 0.0), (2, 0.1)]);
         points.resize(MOST_POINTS + 1, of(1, 0.0));
         assert_eq!(best(&points).count(), MOST_POINTS);
-        // In the scene, and with the cameras.
+        // In scene coordinates, moved with the cameras.
         let mut photos = photos(Scene::Embedded, &[(Split::Train, DVec3::ZERO)]);
         photos.points = vec![(DVec3::new(1.0, 2.0, 3.0), [4, 5, 6])];
         assert_eq!(photos.points(&model(UNIT, &[], false)), [([1.0, 2.0, 3.0], [4, 5, 6])]);
@@ -332,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn large_photographs_keep_their_proportions() {
+    fn shrunk_large_image_keeps_its_aspect() {
         for (size, expected) in [([3200, 100], [1600, 50]), ([20, 1700], [19, 1600]), ([1601, 1], [1600, 1])] {
             let small = shrunk(&Photo::from(Image::new(size[0], size[1], 3)));
             assert_eq!([small.width, small.height], expected);

@@ -1,4 +1,4 @@
-//! Pictures of what pages want to see: a coarse one at once, and finer ones for as long as it is wanted.
+//! Progressive rendering: a coarse render first, then finer ones while the request lasts.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -19,50 +19,50 @@ use super::row_tiles::{LARGE, RowTiles};
 use super::server::sorry;
 use crate::render::shown::Show;
 
-/// How long the first picture of a view may take, in seconds.
+/// Time limit of the first render of a view, in seconds.
 const FIRST: f64 = 0.035;
-/// Rays a second of a model that nothing is known of.
+/// Assumed rays per second of an unmeasured model.
 const RATE: f64 = 1e5;
-/// Weight of the latest piece in the rate that is expected of the next one.
+/// Weight of the latest tile in the estimate of the rate.
 const LATEST: f64 = 0.5;
-/// At most so many times the size is halved: coarser pictures show nothing.
+/// Most halvings of the size. Coarser renders are useless.
 const MOST_HALVINGS: u32 = 7;
-/// At most so many large pictures are painted in turns: each has its memory.
+/// Most large renders in progress, which limits memory.
 const MOST_LARGE: usize = 4;
-/// Quality of JPEG files, 1 to 100, of coarse pictures and of whole ones.
+/// JPEG quality, 1 to 100, of coarse and of full-size renders.
 const QUALITY: [u8; 2] = [75, 92];
-/// How often a picture is painted again while a model learns, at most.
+/// Minimum interval between new renders of a view during training.
 const AGAIN: Duration = Duration::from_millis(500);
 
-/// Paints, a piece at a time.
+/// Renders the requests, tile by tile.
 pub struct Renderer {
     requests: Arc<Requests>,
     photos: Option<Arc<PhotoCache>>,
-    /// The models that can be looked at beside the one at hand, if there are some.
+    /// Models other than the current one, if available.
     models: Option<ModelCache>,
     jobs: Vec<Job>,
-    /// Rays a second, of what was shown lately.
+    /// Measured rays per second, by output and skipping.
     rates: HashMap<(Show, Option<Skip>), f64>,
     turn: u64,
-    /// Whether the last turn was that of something new.
+    /// True if the last tile was the first one of a job.
     fresh: bool,
 }
 
-/// What is being painted.
+/// A render in progress.
 struct Job {
     target: Target,
-    /// How often the size of what is painted now is halved.
+    /// Halvings of the size of the current render.
     halvings: u32,
-    /// What there is of it so far; none before it is begun, and while it rests.
+    /// The rows so far; `None` before the start and while the job rests.
     parts: Option<RowTiles>,
     spent: Duration,
-    /// When it was worked on last, in turns.
+    /// The turn of the last tile.
     turn: u64,
-    /// The step of training at which its picture was begun.
+    /// Training step at the start of the render.
     begun: u64,
-    /// Whether evaluations compare the same.
+    /// True if evaluation uses the same comparison.
     plain: bool,
-    /// If it rests: since which step of training, and when.
+    /// If the job rests: the training step of its last render, and the time.
     whole: Option<(u64, Instant)>,
 }
 
@@ -76,10 +76,10 @@ impl Renderer {
         Renderer { requests, photos, models, jobs: vec![], rates: HashMap::new(), turn: 0, fresh: false }
     }
 
-    /// Paints the next piece, of a model that is at this step; says whether there was anything to paint.
+    /// Renders the next tile with a model at this step. Returns false if there is nothing to render.
     pub fn work(&mut self, model: &Model<f32>, step: u64) -> bool {
         self.sync(step);
-        // What nobody has seen anything of comes first, but not again before something else had its turn.
+        // New jobs come first, unless the last tile was the first one of a job.
         let mut waiting: Vec<usize> = (0..self.jobs.len()).filter(|i| self.jobs[*i].whole.is_none()).collect();
         waiting.sort_by_key(|i| (self.fresh && self.jobs[*i].turn == 0, self.jobs[*i].turn));
         let ready = waiting.into_iter().find_map(|i| self.prepare(i, model, step).map(|(own, step)| (i, own, step)));
@@ -96,7 +96,7 @@ impl Renderer {
         };
         let view = job.target.view();
         let rate = self.rates.entry((view.show, view.skip)).or_insert(RATE);
-        // What is kept is of one step.
+        // A saved render comes from one training step, so all its tiles are rendered now.
         let whole = learns && matches!(job.target, Target::Save(_));
         loop {
             let start = Instant::now();
@@ -104,7 +104,7 @@ impl Renderer {
             let spent = start.elapsed();
             job.spent += spent;
             if painted.is_none() {
-                // It would have been no quicker to the end.
+                // A cancelled tile gives an upper bound of the rate.
                 *rate = rate.min(speed(parts.asked(), job.spent));
                 return true;
             }
@@ -114,7 +114,7 @@ impl Renderer {
             }
         }
         if parts.is_whole() {
-            // Of the whole picture: where there is nothing, rays are quick.
+            // The rate of the whole render, since rays through empty space are fast.
             let now = speed(parts.camera.width * parts.camera.height, job.spent);
             *rate = expected(*rate, now);
             let soon = halvings(view.size, now, AGAIN.as_secs_f64());
@@ -127,14 +127,14 @@ impl Renderer {
         true
     }
 
-    /// Paints the next piece, or waits for so long until something is asked for.
+    /// Renders the next tile, or waits for a request for at most this time.
     pub fn work_or_wait(&mut self, model: &Model<f32>, step: u64, most: Duration) {
         if !self.work(model, step) {
             self.requests.wait(most);
         }
     }
 
-    /// Begins a picture if all that it takes is here; gives the model that it shows, if that is not the one at hand, and its step.
+    /// Starts a render if its inputs are ready. Returns its step, and its model, if that is not the current one.
     fn prepare(&mut self, i: usize, model: &Model<f32>, step: u64) -> Option<(Option<Arc<Model<f32>>>, u64)> {
         let view = self.jobs[i].target.view();
         let unknown = match (&view.eye, &self.photos) {
@@ -176,8 +176,8 @@ impl Renderer {
                 _ => None,
             };
             let job = &mut self.jobs[i];
-            // Where evaluations leave out or correct something, or give a photograph its own code, a figure would be another than
-            // theirs.
+            // The PSNR would differ from evaluation if that uses masks, exposure correction or an image's own
+            // embedding.
             let own = |number| self.photos.as_ref().is_some_and(|photos| photos.is_special(number, model));
             job.plain = model.exposure.is_none() && !number.is_some_and(own);
             (job.parts, job.begun) = (Some(RowTiles::new(camera, number.is_some(), size, truth, model)), step);
@@ -185,7 +185,7 @@ impl Renderer {
         Some((own, step))
     }
 
-    /// Whose camera a view is seen by, if it is a photograph's, and that camera.
+    /// The camera of a view, and the number of its image, if it is an image's camera.
     fn camera(&self, view: &View, size: [usize; 2], model: &Model<f32>) -> (Option<usize>, Camera) {
         let photos = self.photos.as_deref();
         let (number, free) = match &view.eye {
@@ -200,23 +200,23 @@ impl Renderer {
         }
     }
 
-    /// Tells who wants a picture why there is none.
+    /// Sends the reason to the pages of a failed request.
     fn refuse<T>(&mut self, i: usize, what: &str) -> Option<T> {
         match &self.jobs[i].target {
             Target::Wish(wish) => self.requests.refuse(wish, what),
             Target::Save(save) => self.requests.post(save.client, sorry(what)),
         }
-        // It is forgotten with the next look at what is wanted.
+        // The next synchronisation removes the job.
         self.jobs[i].rest(0);
         None
     }
 
-    /// Nobody is there who wants anything.
+    /// Drops all jobs, as no page is connected.
     pub fn clear(&mut self) {
         self.jobs.clear();
     }
 
-    /// Forgets what nobody wants any more, and takes up what is new.
+    /// Removes jobs without a request and adds jobs for new requests.
     fn sync(&mut self, step: u64) {
         let wishes = self.requests.wishes();
         self.jobs.retain(|job| match &job.target {
@@ -233,7 +233,7 @@ impl Renderer {
                 self.jobs.push(Job::new(Target::Wish(wish), halvings));
             }
         }
-        // One after the other: each has a picture's memory.
+        // One save at a time, since each has a full render in memory.
         if !self.jobs.iter().any(|job| matches!(job.target, Target::Save(_)))
             && let Some(save) = self.requests.next_save()
         {
@@ -241,17 +241,17 @@ impl Renderer {
         }
         for job in &mut self.jobs {
             let view = job.target.view();
-            // What a checkpoint shows does not change.
+            // The render of a checkpoint does not change.
             let now = if self.models.is_some() { view.checkpoint.unwrap_or(step) } else { step };
             let Some((seen, when)) = job.whole else { continue };
             if when.elapsed() <= AGAIN.max(job.spent) {
                 continue;
             }
             if seen == now && job.halvings > 0 {
-                // It has not learned for a while: it is held.
+                // Training is paused, so the next render is finer.
                 job.begin(job.halvings - 1);
             } else if seen != now {
-                // What has learned more is seen again, as fine as there is time for.
+                // The model has changed, so the view is rendered again, as fine as the interval allows.
                 let halvings = halved(view, AGAIN.as_secs_f64());
                 job.begin(halvings);
             }
@@ -259,23 +259,23 @@ impl Renderer {
     }
 }
 
-/// Rays a second that are expected after it was `rate`, and `now` lately: between them by factors, as both can be far off.
+/// Estimate of the rate: the weighted geometric mean, as both values may be far off.
 fn expected(rate: f64, now: f64) -> f64 {
     rate * (now / rate).powf(LATEST)
 }
 
-/// Rays a second.
+/// Rays per second.
 fn speed(rays: usize, spent: Duration) -> f64 {
     rays as f64 / spent.as_secs_f64().max(1e-6)
 }
 
-/// How often the next picture's size is halved, if there is one, after one that was halved so often; of a model that learns meanwhile,
-/// none that is finer than what there is time for `soon`: it is rather seen again.
+/// Halvings of the next, finer render, if there is one. During training, no render is finer than the interval `soon`
+/// allows. The view is rendered again instead.
 fn finer(halvings: u32, is_still: bool, soon: u32) -> Option<u32> {
     (halvings > 0 && (is_still || halvings > soon)).then(|| halvings - 1)
 }
 
-/// How often a size is to be halved for a picture to be there in so many seconds.
+/// Halvings of the size for a render within this time.
 fn halvings([width, height]: [u32; 2], rate: f64, seconds: f64) -> u32 {
     let rays = f64::from(width) * f64::from(height);
     let needed = (rays / (rate * seconds)).log2() / 2.0;
@@ -297,20 +297,20 @@ impl Job {
         Job { target, halvings, parts: None, spent: Duration::ZERO, turn: 0, begun: 0, plain: true, whole: None }
     }
 
-    /// A picture of another size comes next.
+    /// Starts a render at another size.
     fn begin(&mut self, halvings: u32) {
         (self.halvings, self.parts, self.spent, self.whole) = (halvings, None, Duration::ZERO, None);
     }
 
-    /// Nothing is to be done for now, and no memory is needed.
+    /// Frees the memory of a job until its view changes.
     fn rest(&mut self, step: u64) {
         (self.parts, self.whole) = (None, Some((step, Instant::now())));
     }
 
-    /// Gives away a picture whose rows are all painted.
+    /// Sends a render that is complete.
     fn deliver(&mut self, requests: &Requests, photos: Option<&PhotoCache>, step: u64) {
         let Some(RowTiles { truth, color, .. }) = &self.parts else { return };
-        // Of a picture that is whole, and of one step.
+        // Only a full-size render of one training step has a PSNR.
         let plain = self.plain && self.halvings == 0 && self.begun == step;
         let is_evaluated =
             |number| plain && photos.is_some_and(|photos| photos.is_evaluated_at(number, [color.width, color.height]));

@@ -1,4 +1,4 @@
-//! Where what pages ask for meets what is painted: one thread paints, and each page has tasks of its own.
+//! Shared state of pages and the renderer. One thread renders, and each page has its own tasks.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -8,26 +8,26 @@ use tokio::sync::Notify;
 
 use super::messages::{self, File, Made, ServerMessage, View};
 
-/// Messages that wait for a page, beside a picture: more than it can have asked for in earnest.
+/// Most messages that wait for a page. Well-behaved pages stay far below.
 const WAITING: usize = 64;
-/// Pictures to keep that wait to be painted or sent, of one page.
+/// Most saves of one page that wait to be rendered or sent.
 const SAVES: usize = 4;
 
-/// What a page wants to see, as long as one does: pages that want the same share it.
+/// A requested view, shared by all pages that request the same one.
 #[derive(Debug)]
 pub struct RenderRequest {
     pub view: View,
     last: Mutex<Option<Arc<RenderedFrame>>>,
 }
 
-/// A picture for pages.
+/// A render for pages.
 #[derive(Debug)]
 pub struct RenderedFrame {
     pub made: Made,
     pub jpeg: Vec<u8>,
 }
 
-/// What is on its way to a page.
+/// Messages that wait to be sent to a page.
 #[derive(Default)]
 pub struct Outbox {
     waiting: Mutex<Waiting>,
@@ -36,12 +36,12 @@ pub struct Outbox {
 
 #[derive(Default)]
 struct Waiting {
-    /// The newest picture; one that nobody has seen yet is not worth sending any more.
+    /// The newest render. It replaces one that was not sent yet.
     picture: Option<(u32, Arc<RenderedFrame>)>,
     others: VecDeque<Outgoing>,
-    /// How training goes, of which the newest is enough.
+    /// The newest state of training.
     told: Option<String>,
-    /// Which picture was sent and has not been seen.
+    /// The render that was sent but not acknowledged.
     flying: Option<InFlight>,
     overrun: bool,
 }
@@ -59,12 +59,12 @@ pub enum Outgoing {
     Bytes(Vec<u8>),
 }
 
-/// That something cannot be had, and why.
+/// The message that a request failed, with the reason.
 pub fn sorry(what: &str) -> Outgoing {
     text(&ServerMessage::Sorry { what: what.to_owned() })
 }
 
-/// A message of text.
+/// A text message.
 pub fn text(tell: &ServerMessage) -> Outgoing {
     Outgoing::Text(messages::text(tell))
 }
@@ -74,7 +74,7 @@ impl Outbox {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Something for the page, in order.
+    /// Appends a message.
     pub fn post(&self, message: Outgoing) {
         let mut waiting = self.lock();
         waiting.overrun |= waiting.others.len() >= WAITING;
@@ -90,12 +90,12 @@ impl Outbox {
         self.changed.notify_one();
     }
 
-    /// The picture that waits is not wanted any more.
+    /// Drops the waiting render.
     fn forget(&self) {
         self.lock().picture = None;
     }
 
-    /// What is to be sent next, if anything may be.
+    /// The next message, if one may be sent.
     pub fn take(&self) -> Option<Outgoing> {
         let mut waiting = self.lock();
         if let Some(message) = waiting.others.pop_front() {
@@ -109,17 +109,17 @@ impl Outbox {
         }
         let (id, shot) = waiting.picture.take()?;
         waiting.flying = Some(InFlight { id, since: Instant::now(), bytes: shot.jpeg.len() });
-        // Nobody has to wait while it is copied.
+        // The lock is released before the render is copied.
         drop(waiting);
         Some(Outgoing::Bytes(File::Picture { id, made: shot.made }.message(&shot.jpeg)))
     }
 
-    /// Since when a picture is under way that the page has not seen, and of how many bytes.
+    /// Send time and length in bytes of the unacknowledged render.
     pub fn flying(&self) -> Option<(Instant, usize)> {
         self.lock().flying.as_ref().map(|flying| (flying.since, flying.bytes))
     }
 
-    /// How many files wait to be sent.
+    /// Number of waiting files.
     pub fn files(&self) -> usize {
         self.lock().others.iter().filter(|message| matches!(message, Outgoing::Bytes(_))).count()
     }
@@ -129,12 +129,12 @@ impl Outbox {
         self.changed.notify_one();
     }
 
-    /// Whether the page does not take what it has asked for.
+    /// Returns true if too many messages wait for the page.
     pub fn is_overrun(&self) -> bool {
         self.lock().overrun
     }
 
-    /// The page has the picture.
+    /// Acknowledges a render.
     pub fn seen(&self, id: u32) {
         self.lock().flying.take_if(|flying| flying.id == id);
         self.changed.notify_one();
@@ -146,7 +146,7 @@ struct Client {
     outbox: Arc<Outbox>,
 }
 
-/// A picture to keep.
+/// A render to save.
 pub struct Save {
     pub client: u64,
     pub view: View,
@@ -157,18 +157,18 @@ struct State {
     clients: BTreeMap<u64, Client>,
     next: u64,
     saves: VecDeque<Save>,
-    /// Whether something was asked for since somebody last waited.
+    /// True if something has changed since the last wait.
     news: bool,
-    /// Whether training is to wait, and whether it is to end.
+    /// True to pause training, and true to stop it.
     paused: bool,
     stops: bool,
-    /// The share of time that pictures get of training.
+    /// Fraction of time for renders during training.
     share: f64,
-    /// What a page is told of the scene when it comes.
+    /// The description of the scene for new pages.
     about: String,
 }
 
-/// What pages and the renderer share.
+/// State that pages and the renderer share.
 #[derive(Default)]
 pub struct Requests {
     state: Mutex<State>,
@@ -180,17 +180,17 @@ impl Requests {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Says what pages are told of the scene when they come from now on.
+    /// Sets the description of the scene for new pages.
     pub fn introduce(&self, about: String) {
         self.lock().about = about;
     }
 
-    /// What a page is told of the scene when it comes.
+    /// The description of the scene for new pages.
     pub fn about(&self) -> String {
         self.lock().about.clone()
     }
 
-    /// A page comes, if there are fewer than so many.
+    /// Adds a page if there are fewer than `most`.
     pub fn join(&self, most: usize) -> Option<(u64, Arc<Outbox>)> {
         let mut state = self.lock();
         if state.clients.len() >= most {
@@ -202,7 +202,7 @@ impl Requests {
         Some((number, outbox))
     }
 
-    /// A page goes.
+    /// Removes a page.
     pub fn leave(&self, client: u64) {
         let mut state = self.lock();
         state.clients.remove(&client);
@@ -210,12 +210,12 @@ impl Requests {
         self.news(&mut state);
     }
 
-    /// How many pages there are.
+    /// Number of connected pages.
     pub fn connected(&self) -> usize {
         self.lock().clients.len()
     }
 
-    /// A page wants to see something else: what it wanted before is forgotten.
+    /// Replaces the request of a page.
     pub fn wish(&self, client: u64, id: u32, view: View) {
         let mut state = self.lock();
         let same = state.clients.values().filter_map(|other| other.wish.as_ref()).find(|(_, wish)| wish.view == view);
@@ -224,7 +224,7 @@ impl Requests {
         if let Some(client) = state.clients.get_mut(&client) {
             let last = wish.last.lock().unwrap_or_else(PoisonError::into_inner).clone();
             client.wish = Some((id, wish));
-            // Of what it wanted before, nothing.
+            // Drops the renders of the old request.
             client.outbox.forget();
             if let Some(shot) = last {
                 client.outbox.show(id, shot);
@@ -233,7 +233,7 @@ impl Requests {
         self.news(&mut state);
     }
 
-    /// A page wants to see nothing for now.
+    /// Removes the request of a page.
     pub fn rest(&self, client: u64) {
         if let Some(client) = self.lock().clients.get_mut(&client) {
             client.wish = None;
@@ -241,7 +241,7 @@ impl Requests {
         }
     }
 
-    /// A page wants a picture to keep; says whether it may.
+    /// Queues a save of a page; returns false if too many wait.
     pub fn save(&self, client: u64, view: View) -> bool {
         let mut state = self.lock();
         let painted = state.clients.get(&client).map_or(0, |client| client.outbox.files());
@@ -253,7 +253,7 @@ impl Requests {
         fits
     }
 
-    /// What pages want to see, each once.
+    /// The requested views without duplicates.
     pub fn wishes(&self) -> Vec<Arc<RenderRequest>> {
         let mut wishes: Vec<Arc<RenderRequest>> = vec![];
         for (_, wish) in self.lock().clients.values().filter_map(|client| client.wish.as_ref()) {
@@ -264,22 +264,22 @@ impl Requests {
         wishes
     }
 
-    /// The next picture to keep.
+    /// Takes the next save from the queue.
     pub fn next_save(&self) -> Option<Save> {
         self.lock().saves.pop_front()
     }
 
-    /// Whether a page is still there.
+    /// Returns true if a page is connected.
     pub fn is_here(&self, client: u64) -> bool {
         self.lock().clients.contains_key(&client)
     }
 
-    /// Whether somebody still wants to see this.
+    /// Returns true if a page still requests this view.
     pub fn wants(&self, wish: &Arc<RenderRequest>) -> bool {
         self.lock().clients.values().filter_map(|client| client.wish.as_ref()).any(|(_, own)| Arc::ptr_eq(own, wish))
     }
 
-    /// This cannot be seen: all who want it are told why, and wait for nothing.
+    /// Removes a request and sends the reason to its pages.
     pub fn refuse(&self, wish: &Arc<RenderRequest>, what: &str) {
         for client in self.lock().clients.values_mut() {
             if client.wish.take_if(|(_, own)| Arc::ptr_eq(own, wish)).is_some() {
@@ -289,7 +289,7 @@ impl Requests {
         }
     }
 
-    /// A picture is ready: all who want it get it.
+    /// Sends a render to all pages that requested it.
     pub fn show(&self, wish: &Arc<RenderRequest>, shot: RenderedFrame) {
         let shot = Arc::new(shot);
         let state = self.lock();
@@ -301,31 +301,31 @@ impl Requests {
         }
     }
 
-    /// A message for one page.
+    /// Sends a message to one page.
     pub fn post(&self, client: u64, message: Outgoing) {
         if let Some(client) = self.lock().clients.get(&client) {
             client.outbox.post(message);
         }
     }
 
-    /// A message for all pages.
+    /// Sends a message to all pages.
     pub fn tell(&self, message: &Outgoing) {
         self.lock().clients.values().for_each(|client| client.outbox.post(message.clone()));
     }
 
-    /// How training goes, for all pages.
+    /// Sends the state of training to all pages.
     pub fn tell_state(&self, text: &str) {
         self.lock().clients.values().for_each(|client| client.outbox.tell_state(text));
     }
 
-    /// Waits until something was asked for since it was called last, no longer than this.
+    /// Waits for a change since the last call, for at most this time.
     pub fn wait(&self, most: Duration) {
         let state = self.lock();
         let waited = self.wake.wait_timeout_while(state, most, |state| !state.news);
         waited.unwrap_or_else(PoisonError::into_inner).0.news = false;
     }
 
-    /// Wakes who waits.
+    /// Wakes the waiting renderer.
     pub fn wake(&self) {
         self.news(&mut self.lock());
     }
@@ -335,36 +335,36 @@ impl Requests {
         self.wake.notify_all();
     }
 
-    /// Whether training is to wait.
+    /// Returns true if training must pause.
     pub fn paused(&self) -> bool {
         self.lock().paused
     }
 
-    /// Lets training wait or go on.
+    /// Pauses or resumes training.
     pub fn pause(&self, pause: bool) {
         let mut state = self.lock();
         state.paused = pause;
         self.news(&mut state);
     }
 
-    /// Whether training is to end.
+    /// Returns true if training must stop.
     pub fn stops(&self) -> bool {
         self.lock().stops
     }
 
-    /// Lets training end.
+    /// Stops training.
     pub fn stop(&self) {
         let mut state = self.lock();
         state.stops = true;
         self.news(&mut state);
     }
 
-    /// The share of time that pictures get of training.
+    /// Fraction of time for renders during training.
     pub fn share(&self) -> f64 {
         self.lock().share
     }
 
-    /// Sets it.
+    /// Sets the fraction of time for renders.
     pub fn set_share(&self, share: f64) {
         self.lock().share = share;
     }

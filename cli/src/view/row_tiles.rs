@@ -1,4 +1,4 @@
-//! A picture that is painted a few rows at a time.
+//! Rendering in tiles of rows.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,24 +12,25 @@ use super::messages::{View, at_size};
 use crate::output::depth_colors;
 use crate::render::shown::{Show, facing, over};
 
-/// How long a piece of a picture may take, in seconds.
+/// Time limit of a tile, in seconds.
 const PIECE: f64 = 0.08;
-/// A picture of more pixels is large.
+/// Renders with more pixels are large.
 pub const LARGE: usize = 1 << 20;
 
-/// The rows of a picture that are painted.
+/// A render in progress, in tiles of rows.
 pub struct RowTiles {
     pub camera: Camera,
-    /// The photograph that it is compared with, in its size.
+    /// The compared image at the render's size.
     pub truth: Option<(usize, Image)>,
     pub color: Image,
     pub rows: usize,
-    /// How many rows are painted at a time; before the first, none.
+    /// Rows per tile; 0 before the first tile.
     band: usize,
 }
 
 impl RowTiles {
-    /// Of a photograph's camera, that takes its proportions from there; beside what it is compared with, if it is.
+    /// Starts a render. With an image's camera, the render keeps the image's aspect ratio. `truth` is the compared
+    /// image, if any.
     pub fn new(
         camera: Camera,
         is_photograph: bool,
@@ -38,7 +39,7 @@ impl RowTiles {
         model: &Model<f32>,
     ) -> Self {
         let sides = [camera.width, camera.height];
-        // All of it is to be seen; and photographs are not made larger to be compared.
+        // The whole image is visible. Compared images are not enlarged.
         let largest = truth.as_ref().map_or(size, |(_, photo)| [photo.width.min(size[0]), photo.height.min(size[1])]);
         let share = (0..2).map(|i| largest[i] as f64 / sides[i] as f64).fold(f64::INFINITY, f64::min);
         let [width, height] = [0, 1].map(|i| ((sides[i] as f64 * share).round() as usize).clamp(1, largest[i]));
@@ -48,7 +49,7 @@ impl RowTiles {
         RowTiles { color: Image::new(camera.width, camera.height, 3), camera, truth, rows: 0, band: 0 }
     }
 
-    /// How many rays were asked for so far, those of the rows at hand too.
+    /// Number of rays so far, including the current tile.
     pub fn asked(&self) -> usize {
         self.camera.width * (self.rows + self.band).min(self.camera.height)
     }
@@ -61,7 +62,7 @@ impl RowTiles {
         self.camera.width * self.camera.height > LARGE
     }
 
-    /// Paints as many rows as there is time for; nothing if it was stopped.
+    /// Renders as many rows as the time limit allows; `None` if it was cancelled.
     pub fn paint(
         &mut self,
         view: &View,
@@ -75,18 +76,18 @@ impl RowTiles {
         }
         self.band = self.band.clamp(1, height);
         let rows = self.band.min(height - self.rows);
-        // What is above lies outside of the picture.
+        // Moves the principal point, so that the camera starts at this row.
         let band = Camera { height: rows, centre: [centre[0], centre[1] - self.rows as f64], ..self.camera.clone() };
         let background = match view.background {
             Some(color) => color.map(|value| f32::from(value) / 255.0),
             None => model.config.background.shown(),
         };
-        // As evaluations have it.
+        // Comparisons use the background of evaluation.
         let background = if self.truth.is_some() { model.config.background.shown() } else { background };
-        // And photographs show all there is.
+        // Comparisons show the whole scene.
         let crop = view.crop.filter(|_| self.truth.is_none());
         let crop = crop.map_or(RenderOptions::over(background).crop, |corners| corners.map(DVec3::from));
-        // A model of the models leaves out what it is to: this is for others too.
+        // Models from the cache already have their skipping. This override disables it for other models too.
         let limits = (view.skip == Some(Skip::Off)).then_some(RayTolerance::NONE);
         let viewing = RenderOptions { background, tolerance: limits, crop, keep_going: goes_on };
         let picture = model.render_cancellable(&band, &viewing)?;
@@ -102,14 +103,15 @@ impl RowTiles {
         Some(())
     }
 
-    /// Chooses the next rows by how long the last ones took: few more than those, as they may show more.
+    /// Sets the rows of the next tile from the time of the last one. It grows at most twofold, as later rows may be
+    /// slower.
     pub fn pace(&mut self, spent: Duration) {
         let fitting = self.band as f64 * PIECE / spent.as_secs_f64().max(1e-4);
         self.band = (fitting as usize).clamp(1, 2 * self.band);
     }
 }
 
-/// Opacity as a colour.
+/// Opacity as a grey image.
 fn grey(picture: &Render) -> Image {
     let Image { width, height, ref data, .. } = picture.opacity;
     Image { width, height, channels: 3, data: data.iter().flat_map(|x| [*x; 3]).collect() }
@@ -126,7 +128,7 @@ fn normals(
     Some(over(&colors, &picture.opacity, viewing.background))
 }
 
-/// How many rows of so many rays there is time for.
+/// Number of rows of this width that fit into the time.
 fn rows_in(seconds: f64, rate: f64, width: usize) -> usize {
     (rate * seconds / width as f64) as usize
 }
@@ -141,13 +143,13 @@ pub mod tests {
     use super::*;
     use crate::view::messages::Eye;
 
-    /// From this far to the right, looking at the scene.
+    /// A free view from this x coordinate towards the scene.
     pub fn free(x: f64, size: [u32; 2]) -> View {
         let pose = [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
         serde_json::from_value(json!({ "eye": { "free": { "pose": pose, "fov": 50.0 } }, "size": size })).unwrap()
     }
 
-    /// A small model that nothing is known of, so thick that what is left out shows.
+    /// A small untrained model, dense enough that skipping is visible.
     pub fn fog() -> Model<f32> {
         let mut config = Config::preset(Preset::Instant);
         config.sampler.get_mut::<MarchingConfig>().unwrap().occupancy.resolution = 16;
@@ -157,7 +159,7 @@ pub mod tests {
     }
 
     #[test]
-    fn render_piece_fits_the_time_it_has() {
+    fn first_tile_fits_the_time() {
         let model = fog();
         let painted = |view: &View, rate: f64| {
             let Eye::Free { pose, fov } = &view.eye else { panic!() };
@@ -172,7 +174,7 @@ pub mod tests {
         let whole = painted(&view, 1e9);
         assert_eq!((whole.rows, whole.asked(), whole.is_whole()), (48, 64 * 48, true));
         assert_eq!(parts.color.data[..3 * 64 * 16], whole.color.data[..3 * 64 * 16], "the upper rows of the same");
-        // All light, where that is asked for.
+        // With skipping disabled.
         let seen = |view: &View| painted(view, 1e9).color;
         let (usual, all) =
             (model.render(&whole.camera, [1.0; 3]), model.render_within(&whole.camera, [1.0; 3], &RayTolerance::NONE));
@@ -183,7 +185,7 @@ pub mod tests {
     }
 
     #[test]
-    fn pieces_take_as_long_as_they_may() {
+    fn next_tile_adapts_to_the_time() {
         assert_eq!([rows_in(0.08, 1e5, 800), rows_in(0.08, 1e3, 800), rows_in(0.5, 1e5, 100)], [10, 0, 500]);
         let camera = Camera::from_angle(64, 64, 1.0, DAffine3::IDENTITY);
         let paced = |milliseconds: u64| {
@@ -192,12 +194,12 @@ pub mod tests {
             parts.pace(Duration::from_millis(milliseconds));
             parts.band
         };
-        // Twice as many at most, half as many after what took twice as long, and never none.
+        // At most twice as many rows, half as many after a tile of twice the time, and at least one.
         assert_eq!([paced(1), paced(80), paced(160), paced(10_000)], [16, 8, 4, 1]);
     }
 
     #[test]
-    fn pictures_of_more_than_a_megapixel_are_large() {
+    fn render_over_a_megapixel_is_large() {
         let is_large = |width: usize, height: usize| {
             let (camera, color) = (Camera::from_angle(width, height, 1.0, DAffine3::IDENTITY), Image::new(1, 1, 3));
             RowTiles { camera, truth: None, color, rows: 0, band: 0 }.is_large()

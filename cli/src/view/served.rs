@@ -1,4 +1,4 @@
-//! What all connections know, and how much they may take.
+//! State and limits that all connections share.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,27 +9,27 @@ use super::photo_cache::PhotoCache;
 use super::requests::Requests;
 use super::video_jobs::VideoJobs;
 
-/// How much pages and connections may take, and how long they are waited for.
+/// Resource limits and time-outs of pages and connections.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// Pages at a time, and connections that are no pages yet.
+    /// Most pages, and most connections before they become pages.
     pub pages: usize,
     pub connections: usize,
-    /// How long one may last that does not become a page.
+    /// Time-out of a connection that does not become a page.
     pub connected: Duration,
-    /// Bytes of a message from a page.
+    /// Largest message from a page, in bytes.
     pub longest: usize,
-    /// Messages a second from a page, and how many may come at once.
+    /// Messages per second from a page, and the largest burst.
     pub rate: f64,
     pub burst: f64,
-    /// How long a request may take to arrive, and a page to take a message or say that it has seen a picture, beside what its
-    /// bytes take, at so many a second.
+    /// Time-out of requests, of sent messages and of acknowledgements, in addition to their length at the slowest bytes
+    /// per second.
     pub patience: Duration,
     pub slowest: usize,
-    /// How often a page is asked whether it is still there, and how long it is not heard before it is taken to be gone.
+    /// Interval of pings, and the silence after which a page counts as gone.
     pub idle: Duration,
     pub silence: Duration,
-    /// Files that may wait for a page when it asks for a photograph.
+    /// Most waiting files when a page requests an image.
     pub files: usize,
 }
 
@@ -48,31 +48,31 @@ impl Limits {
         files: 4,
     };
 
-    /// How long so many bytes may take.
+    /// Time-out of a message of this length.
     pub fn patience_for(&self, bytes: usize) -> Duration {
         self.patience + Duration::from_secs((bytes / self.slowest) as u64)
     }
 
-    /// How many messages may still come after one more, if it was so many so many seconds ago; less than none if it is one too
-    /// many.
+    /// Token bucket: the number of messages that may follow after one more. `before` is the number of `seconds` ago.
+    /// Negative if the message exceeds the limit.
     pub fn allowed(&self, before: f64, seconds: f64) -> f64 {
         (before + self.rate * seconds).min(self.burst) - 1.0
     }
 }
 
-/// What all connections know.
+/// State that all connections share.
 pub struct Served {
     pub requests: Arc<Requests>,
     pub photos: Option<Arc<PhotoCache>>,
-    /// What makes videos, if they can be made.
+    /// Renders videos, if available.
     pub video_jobs: Option<Arc<VideoJobs>>,
-    /// What photographs that have transparency stand before.
+    /// Background of transparent images.
     pub background: [f32; 3],
-    /// The name of this machine that pages may use, beside its addresses.
+    /// The host name that pages may use besides IP addresses.
     pub host: String,
-    /// What links must have, where others than this machine can follow them.
+    /// Token that links need if other machines can connect.
     pub token: Option<String>,
-    /// Photographs that are read at a time.
+    /// Limits the number of images that are read at a time.
     pub readers: Semaphore,
     pub limits: Limits,
 }
@@ -82,26 +82,26 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_large_may_take_longer() {
+    fn patience_grows_with_the_length() {
         let seconds = |bytes: usize| Limits::USUAL.patience_for(bytes).as_secs_f64();
         assert_eq!([seconds(0), seconds(49_999), seconds(50_000), seconds(1_000_000)], [10.0, 10.0, 11.0, 30.0]);
     }
 
     #[test]
-    fn messages_come_so_often_and_no_more() {
+    fn allowed_limits_rate_and_burst() {
         let allowed = |before: f64, seconds: f64| Limits::USUAL.allowed(before, seconds);
         assert_eq!(
             [allowed(600.0, 0.0), allowed(0.0, 0.0), allowed(0.0, 1.5), allowed(9.0, 60.0)],
             [599.0, -1.0, 449.0, 599.0]
         );
-        // A hand that moves says so 60 times a second, and more at once after a pause.
+        // A pointer moves 60 times per second, with bursts after a pause.
         let limits = Limits::USUAL;
         assert!(limits.rate >= 120.0 && limits.burst >= limits.rate);
     }
 
     #[test]
-    fn who_is_asked_has_time_to_answer() {
-        // A page that is asked once in vain is there still.
+    fn silence_allows_one_missed_ping() {
+        // One missed ping does not drop a page.
         let Limits { idle, silence, patience, connected, .. } = Limits::USUAL;
         assert!(2 * idle + patience < silence && patience < connected);
     }

@@ -1,4 +1,4 @@
-//! The page and its messages, over HTTP on one port, and nothing else.
+//! HTTP server of the page and its WebSocket.
 
 use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
 use std::sync::Arc;
@@ -28,10 +28,10 @@ use super::video_jobs::VideoJobs;
 
 pub use super::requests::{sorry, text};
 
-/// Bytes of what is asked before it is answered.
+/// Longest request head, in bytes.
 const HEAD: usize = 1 << 14;
 
-/// What is served.
+/// The static files.
 const FILES: [(&str, &str, &str); 4] = [
     ("/", "text/html; charset=utf-8", include_str!("page/index.html")),
     ("/view.css", "text/css; charset=utf-8", include_str!("page/view.css")),
@@ -39,7 +39,7 @@ const FILES: [(&str, &str, &str); 4] = [
     ("/view.js", "text/javascript; charset=utf-8", include_str!("page/view.js")),
 ];
 
-/// A port that is taken, and the name of this machine that pages may use.
+/// A bound port, and the host name that pages may use.
 pub struct Listener {
     listener: TcpListener,
     address: SocketAddr,
@@ -47,10 +47,11 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// Takes a port, 0 for any that is free.
+    /// Binds a port; 0 selects a free one.
     ///
     /// # Errors
-    /// If the host is not known or the port is taken.
+    ///
+    /// Fails if the host is unknown or the port is in use.
     pub fn bind(host: &str, port: u16) -> Result<Self> {
         let bad = |e: std::io::Error| Error::setting("host", format!("{host}:{port} cannot be used: {e}"));
         let listener = TcpListener::bind((host, port)).map_err(bad)?;
@@ -59,10 +60,11 @@ impl Listener {
     }
 }
 
-/// Begins to serve, on threads of its own; gives the link.
+/// Starts the server threads and returns the link.
 ///
 /// # Errors
-/// If the system has no thread left.
+///
+/// Fails if the system cannot start a thread.
 pub fn serve(
     listener: Listener,
     requests: Arc<Requests>,
@@ -98,8 +100,7 @@ fn serve_within(
     Ok(link)
 }
 
-/// The link to an address, under the host that it was asked for by; or where it is all of this machine's, to the one by which
-/// it goes out.
+/// The link to an address. It uses the requested host, or the outward address if the server listens on all addresses.
 fn link(address: SocketAddr, host: &str, outward: Option<IpAddr>, token: Option<&str>) -> String {
     let host = match address.ip() {
         ip if ip.is_loopback() => ip.to_string(),
@@ -111,14 +112,14 @@ fn link(address: SocketAddr, host: &str, outward: Option<IpAddr>, token: Option<
     format!("http://{host}:{}/{token}", address.port())
 }
 
-/// The address of this machine by which it goes out to another. Nothing is sent.
+/// The local address of outgoing connections to another address. Sends nothing.
 fn outward(own: IpAddr, other: &str) -> Option<IpAddr> {
     let socket = UdpSocket::bind((own, 0)).ok()?;
     socket.connect(other).ok()?;
     Some(socket.local_addr().ok()?.ip()).filter(|ip| !ip.is_unspecified())
 }
 
-/// An address that is kept for documentation, beyond any network of one's own.
+/// An address reserved for documentation, which is outside of any local network.
 fn beyond(own: IpAddr) -> &'static str {
     if own.is_ipv4() { "192.0.2.1:9" } else { "[2001:db8::1]:9" }
 }
@@ -128,7 +129,7 @@ async fn accept(listener: tokio::net::TcpListener, router: Router, limits: Limit
     loop {
         let Ok(permit) = permits.clone().acquire_owned().await else { return };
         let Ok((stream, _)) = listener.accept().await else {
-            // Too many files are open, say.
+            // For example, too many files are open.
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
@@ -137,7 +138,7 @@ async fn accept(listener: tokio::net::TcpListener, router: Router, limits: Limit
         tokio::spawn(async move {
             let mut http = hyper::server::conn::http1::Builder::new();
             http.timer(TokioTimer::new()).header_read_timeout(limits.patience).max_buf_size(HEAD);
-            // A connection that is cut off is nobody's loss; what becomes of one that is a page is no longer seen here.
+            // Errors of a connection need no handling. After an upgrade, the page's own task handles the connection.
             let served = http.serve_connection(TokioIo::new(stream), service).with_upgrades();
             let _ = timeout(limits.connected, served).await;
             drop(permit);
@@ -157,7 +158,7 @@ async fn file(method: Method, uri: Uri, State(served): State<Arc<Served>>, query
     if method != Method::GET && method != Method::HEAD {
         return (StatusCode::METHOD_NOT_ALLOWED, [(header::ALLOW, "GET, HEAD")]).into_response();
     }
-    // Style and script are no secret.
+    // Style sheet and scripts need no token.
     if *path == "/" && !query.opens(served.token.as_deref()) {
         return (StatusCode::FORBIDDEN, "The token is missing or wrong. Open the link that raygrad printed.\n")
             .into_response();
@@ -171,7 +172,7 @@ async fn messages(
     headers: HeaderMap,
     upgrade: WebSocketUpgrade,
 ) -> Response {
-    // Browsers always say where a page is from that asks for this.
+    // Browsers always send the origin of a WebSocket request.
     let origin = headers.get(header::ORIGIN).is_some();
     if !query.opens(served.token.as_deref()) || !origin {
         return (StatusCode::FORBIDDEN, "Only the viewer page may connect.\n").into_response();

@@ -1,4 +1,4 @@
-//! A window on a scene that is being trained.
+//! The viewer during training.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -18,39 +18,39 @@ use crate::progress::spoken;
 use crate::run::Run;
 use crate::summary::Ended;
 
-/// The share of time that pictures get at first.
+/// Initial fraction of time for renders.
 const SHARE: f64 = 0.3;
-/// Seconds of painting that can be saved up, for the next picture to come at once.
+/// Most render time in seconds that carries over, so that a new request starts at once.
 const MOST_CREDIT: f64 = 0.1;
-/// How often pages are told how training goes.
+/// Interval between messages on the state of training.
 const TOLD: Duration = Duration::from_millis(400);
-/// How often they are told where photographs were taken, while that is learned.
+/// Interval between messages on the cameras with pose refinement.
 const CAMERAS: Duration = Duration::from_secs(5);
-/// How long training that was paused waits for a page when none is there any more.
+/// After this time without a page, paused training resumes.
 const ALONE: Duration = Duration::from_secs(60);
-/// How long a page may be gone, after training, that is loaded anew.
+/// Time that a page may take to reload after training.
 const GONE: Duration = Duration::from_secs(3);
-/// How long it waits for something to paint while training is held or has ended.
+/// Time that the renderer waits for requests while training is paused or has ended.
 const WAIT: Duration = Duration::from_millis(200);
-/// Points of a curve, after which every second one is dropped.
+/// Most points of a curve. Beyond that, every second one is dropped.
 const POINTS: usize = 240;
 
-/// Lets pages look at training, and takes what they say of it.
+/// The viewer of a training run, which also handles commands of pages.
 pub struct TrainingViewer {
     run: Run,
     requests: Arc<Requests>,
     photos: Option<Arc<PhotoCache>>,
     renderer: Renderer,
-    /// Seconds of training of which pictures have had their share, and how many seconds of painting training owes them.
+    /// Training time up to the last step, and the render time in seconds that is due.
     trained: f64,
     credit: f64,
     told: Rhythm,
-    /// Where photographs were when pages were told last, and how often they are told.
+    /// Cameras that pages have, and the interval of their updates.
     taken: (Taken, Rhythm),
     curves: Curves,
 }
 
-/// What happens again and again, no sooner than after so long.
+/// A periodic event with a minimum interval.
 struct Rhythm {
     each: Duration,
     last: Instant,
@@ -61,7 +61,7 @@ impl Rhythm {
         Rhythm { each, last }
     }
 
-    /// Whether it is to happen now: then it has.
+    /// Returns true if the event is due, and starts the next interval.
     fn is_due(&mut self, now: Instant) -> bool {
         let due = now.saturating_duration_since(self.last) >= self.each;
         if due {
@@ -71,7 +71,7 @@ impl Rhythm {
     }
 }
 
-/// How training went, at every so many steps.
+/// Training curves at regular steps.
 struct Curves {
     every: u64,
     points: Vec<Point>,
@@ -85,7 +85,7 @@ struct Point {
 }
 
 impl TrainingViewer {
-    /// Begins to serve the page of a run that is about to be trained.
+    /// Starts the viewer of a new training run.
     pub fn open(listener: Listener, run: &Run, trainer: &Trainer) -> Result<Self> {
         let (requests, photos) = (Arc::new(Requests::default()), photos(run, None));
         requests.set_share(SHARE);
@@ -100,12 +100,12 @@ impl TrainingViewer {
         Ok(TrainingViewer { run: run.clone(), requests, photos, renderer, trained, credit: 0.0, told, taken, curves })
     }
 
-    /// Called after each step; `left` says how many seconds of training there are. Paints for as long as its share is, and
-    /// waits for as long as a page wants training to. Says whether a page wants it to end.
+    /// Called after each step with the remaining seconds of training. Renders for the due time, and waits while
+    /// training is paused. Returns true if a page stops training.
     pub fn step(&mut self, trainer: &Trainer, psnr: f64, left: f64) -> bool {
         let stats = trainer.stats();
         self.curves.step(&stats, psnr);
-        // After a run went back, time has, too.
+        // A return to a checkpoint also resets the time.
         let trained = (stats.train_seconds - self.trained).max(0.0);
         self.trained = stats.train_seconds;
         if is_unseen(self.requests.connected(), self.requests.paused()) {
@@ -141,12 +141,12 @@ impl TrainingViewer {
         self.requests.stops()
     }
 
-    /// Whether training is to end.
+    /// Returns true if training must end.
     fn is_over(&self) -> bool {
         self.requests.stops() || interrupt::requested()
     }
 
-    /// Tells pages that training has ended, and how; and shows them the scene until the last one has gone.
+    /// Tells pages how training ended, and renders for them until the last one disconnects.
     pub fn end(&mut self, trainer: &Trainer, ended: Ended) {
         let how = match ended {
             Ended::Done => "done",
@@ -159,7 +159,7 @@ impl TrainingViewer {
             return;
         }
         if interrupt::requested() {
-            // For it to arrive before the program ends.
+            // Time for the message to be sent before the program ends.
             std::thread::sleep(Duration::from_millis(100));
         } else {
             note("the viewer stays open until its page closes; Ctrl-C ends it now");
@@ -190,7 +190,7 @@ impl TrainingViewer {
         }))));
     }
 
-    /// Tells pages where photographs were taken, if more of that is known by now.
+    /// Sends the cameras to pages if they have changed.
     fn tell_taken(&mut self, model: &Model<f32>) {
         let (known, rhythm) = &mut self.taken;
         if model.camera_optimizer.is_none() || !rhythm.is_due(Instant::now()) {
@@ -205,12 +205,12 @@ impl TrainingViewer {
     }
 }
 
-/// Since when there is no page.
+/// Start of the time without pages.
 #[derive(Default)]
 struct Alone(Option<Instant>);
 
 impl Alone {
-    /// Whether there has been none for so long; one that is loaded anew comes back soon.
+    /// Returns true if no page was connected for longer than the limit. A reloaded page reconnects soon.
     fn is_longer(&mut self, pages: usize, limit: Duration) -> bool {
         if pages > 0 {
             self.0 = None;
@@ -220,18 +220,18 @@ impl Alone {
     }
 }
 
-/// Whether nobody looks, and nobody has held training.
+/// Returns true if no page is connected and training is not paused.
 fn is_unseen(pages: usize, paused: bool) -> bool {
     pages == 0 && !paused
 }
 
-/// Whether training owes pictures time.
+/// Returns true if render time is due.
 fn is_owed(credit: f64) -> bool {
     credit > 0.0
 }
 
-/// The seconds of painting that training owes after it had so many for itself: pictures are to get their share of both. What was
-/// not asked for is not saved up, but for a little.
+/// The due render time in seconds after training for `trained` seconds. Renders get `share` of the total time. Unused
+/// time carries over only up to a limit.
 fn credit(before: f64, trained: f64, share: f64) -> f64 {
     before.min(MOST_CREDIT) + trained * share / (1.0 - share)
 }
@@ -241,7 +241,7 @@ impl Curves {
         if !stats.step.is_multiple_of(self.every) {
             return;
         }
-        // After a run went back.
+        // Drops points after a return to a checkpoint.
         self.points.retain(|point| point.step < stats.step);
         let speed = stats.rays as f64 / stats.train_seconds.max(1e-9);
         self.points.push(Point { step: stats.step, loss: stats.loss, psnr, speed });
@@ -257,22 +257,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pictures_get_their_share() {
-        // Of a second of training, as much again for half of the time, and a ninth for a tenth.
+    fn credit_gives_renders_their_fraction() {
+        // For a second of training: a second at a fraction of a half, a ninth at a tenth.
         assert_eq!(credit(0.0, 1.0, 0.5), 1.0);
         assert!((credit(0.0, 1.0, 0.1) - 1.0 / 9.0).abs() < 1e-12);
         assert_eq!([credit(0.0, 1.0, 0.0), credit(9.0, 0.0, 0.5), credit(-9.0, 0.0, 0.5)], [0.0, MOST_CREDIT, -9.0]);
     }
 
     #[test]
-    fn nothing_is_rendered_for_nobody() {
+    fn unseen_without_pages_and_pause() {
         let all = [(0, false), (0, true), (1, false), (1, true)].map(|(pages, paused)| is_unseen(pages, paused));
         assert_eq!(all, [true, false, false, false]);
         assert_eq!([0.0, 1e-9, -1e-9].map(is_owed), [false, true, false]);
     }
 
     #[test]
-    fn what_happens_again_happens_after_its_time_and_once() {
+    fn rhythm_is_due_once_per_interval() {
         let begun = Instant::now();
         let mut rhythm = Rhythm::new(Duration::from_secs(5), begun);
         let at = |seconds: f64| begun + Duration::from_secs_f64(seconds);
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn lonely_training_is_known_until_a_page_comes() {
+    fn alone_counts_until_a_page_connects() {
         let mut alone = Alone::default();
         let short = Duration::from_millis(20);
         assert!(!alone.is_longer(0, short) && !alone.is_longer(1, Duration::ZERO));
@@ -296,8 +296,8 @@ mod tests {
     }
 
     #[test]
-    fn curves_are_of_even_steps_however_long_they_get() {
-        // Of a run that is gone on with, too.
+    fn curves_of_long_runs_have_even_steps() {
+        // Also for a resumed run.
         for first in [1, 5000] {
             let (mut curves, mut most) = (Curves { every: 1, points: vec![] }, 0);
             for step in first..first + 5000 {
@@ -314,7 +314,7 @@ mod tests {
             let last = &curves.points[curves.points.len() - 1];
             assert!(last.step + curves.every >= first + 5000 && last.step.is_multiple_of(curves.every));
             assert!(last.loss == last.step as f64 && last.psnr == 0.5 && (last.speed - 10.0).abs() < 1e-9);
-            // It went back, and takes other ways.
+            // The run returns to a checkpoint.
             let (step, before) = (curves.points[40].step, curves.points[39].step);
             curves.step(&StepStats { step, loss: 0.5, ..StepStats::default() }, 0.5);
             assert!(curves.points.len() == 41 && curves.points[40].loss == 0.5 && curves.points[39].step == before);

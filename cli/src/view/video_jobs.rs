@@ -1,4 +1,4 @@
-//! Videos that pages have made: one at a time, by `raygrad render` in a process of its own.
+//! Videos for pages: one at a time, by `raygrad render` in a child process.
 
 use std::ffi::OsString;
 use std::fs;
@@ -18,28 +18,28 @@ use crate::render::{frames_of, video_ending};
 use crate::run::Run;
 use crate::scene::Scene;
 
-/// Videos in a run's folder, after which no page gets another.
+/// Most videos in a run's folder.
 const MOST: u32 = 999;
 
-/// Makes videos of a run.
+/// Renders videos of a run.
 pub struct VideoJobs {
     run: Arc<Run>,
     scene: Option<Scene>,
     requests: Arc<Requests>,
-    /// Held for a moment only: pages wait for it.
+    /// Held only briefly, since pages wait for it.
     work: Mutex<Work>,
 }
 
-/// What is being made, until the program that makes it has ended.
+/// State of the video, until its process has ended.
 enum Work {
     Nothing,
-    /// A video whose program is being started.
+    /// The process is being started.
     Begun,
-    /// One that goes on for as long as this is held, and ends with this program.
+    /// A running process. It ends when its standard input closes, also if this program ends.
     Video {
         _input: Option<ChildStdin>,
     },
-    /// One that nobody wants any more, whose frame is finished.
+    /// A cancelled video, whose process finishes its frame.
     Ending,
 }
 
@@ -52,12 +52,13 @@ impl VideoJobs {
         self.work.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Begins a video; all pages are told how it goes.
+    /// Starts a video and reports its progress to all pages.
     ///
     /// # Errors
-    /// If another is being made, or the run's folder takes no files.
+    ///
+    /// Fails if another video is being rendered or the run's folder is not writable.
     pub fn begin(self: &Arc<Self>, video: &VideoRequest) -> Result<()> {
-        // Another program is asked, which may take its time.
+        // Determined once, since it looks for an encoder of ffmpeg.
         static ENDING: OnceLock<&str> = OnceLock::new();
         let program = std::env::current_exe().map_err(|e| Error::setting("video", format!("cannot be made: {e}")))?;
         self.make(&program, video, || ENDING.get_or_init(video_ending))
@@ -77,7 +78,7 @@ impl VideoJobs {
         begun
     }
 
-    /// Takes the place of the one video that may be made.
+    /// Reserves the only video slot.
     pub fn claim(&self) -> Result<()> {
         let mut work = self.lock();
         let busy = match *work {
@@ -107,17 +108,17 @@ impl VideoJobs {
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn()?;
         let input = child.stdin.take();
         let mut work = self.lock();
-        // One that was ended meanwhile has no input, and ends.
+        // If the video was cancelled meanwhile, the input closes here and the process ends.
         if matches!(*work, Work::Begun) {
             *work = Work::Video { _input: input };
         }
         drop(work);
         let (video_jobs, path, out) = (self.clone(), path.to_owned(), out.to_owned());
-        // Without the thread the child ends with its input.
+        // Without the thread, the closed input ends the process.
         std::thread::Builder::new().name("video".into()).spawn(move || video_jobs.follow(child, &path, &out)).map(drop)
     }
 
-    /// Tells of a video until it has ended; of one that nobody wants any more nothing is left.
+    /// Reports the progress of a video until it ends. Removes the files of a cancelled one.
     fn follow(&self, mut child: Child, path: &Path, out: &Path) {
         self.tell(out, "started", false);
         let (words, mut last) = (child.stderr.take(), String::new());
@@ -127,7 +128,7 @@ impl VideoJobs {
         }
         let words = match child.wait() {
             Ok(status) if status.success() => "done",
-            // It says itself why.
+            // The program has printed the reason.
             Ok(status) if status.code().is_some_and(|code| code != i32::from(interrupt::EXIT_CODE)) => &last,
             _ => {
                 let _ = fs::remove_dir_all(frames_of(out));
@@ -135,12 +136,12 @@ impl VideoJobs {
                 "cancelled"
             }
         };
-        // Who is told may ask for the next.
+        // The slot is free before pages are told, since a page may start the next video then.
         *self.lock() = Work::Nothing;
         self.tell(out, words, true);
     }
 
-    /// Ends the video that is being made, with its frame.
+    /// Cancels the video after its current frame.
     pub fn end(&self) {
         let mut work = self.lock();
         if !matches!(*work, Work::Nothing) {
@@ -154,7 +155,7 @@ impl VideoJobs {
     }
 }
 
-/// What `raygrad` is started with to make a video.
+/// The arguments of `raygrad` for a video.
 fn arguments(run: &Path, scene: Option<&Scene>, video: &VideoRequest, path: &Path, out: &Path) -> Vec<OsString> {
     let show = json!(video.show);
     let mut arguments: Vec<OsString> = vec!["--threads".into(), rayon::current_num_threads().to_string().into()];
@@ -172,7 +173,7 @@ fn arguments(run: &Path, scene: Option<&Scene>, video: &VideoRequest, path: &Pat
     arguments
 }
 
-/// Writes a path to the first file of a folder whose name is free, for it and for its video: `video-1.json`, `video-2.json` ...
+/// Writes a path to the first free name for it and its video: `video-1.json`, `video-2.json` ...
 fn new_file(folder: &Path, path: &Value) -> Result<PathBuf> {
     make_folder(folder)?;
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
@@ -182,7 +183,7 @@ fn new_file(folder: &Path, path: &Value) -> Result<PathBuf> {
         return Err(Error::file(folder, format!("holds {MOST} videos, the most allowed: remove some")));
     };
     let file = folder.join(name + "json");
-    // Another program's, that has come between, stays.
+    // A file that another program has just created is kept.
     let written = fs::File::create_new(&file).and_then(|mut out| out.write_all(path.to_string().as_bytes()));
     written.map_err(|e| Error::file(&file, format!("cannot be written: {e}")))?;
     Ok(file)
@@ -195,7 +196,7 @@ mod tests {
     use raygrad::nerf::space::occupancy::Skip;
 
     #[test]
-    fn no_video_takes_the_place_of_another() {
+    fn new_file_skips_used_names() {
         let folder = tempfile::tempdir().unwrap();
         let videos = folder.path().join("videos");
         let made = |value: u32| new_file(&videos, &Value::from(value)).unwrap();
@@ -204,7 +205,7 @@ mod tests {
         fs::remove_file(&first).unwrap();
         assert_eq!(made(3), first);
         assert_eq!(fs::read_to_string(&first).unwrap() + &fs::read_to_string(&second).unwrap(), "32");
-        // Nor of one whose path is gone.
+        // A video without its path file also counts.
         fs::write(videos.join("video-3.mp4"), "").unwrap();
         fs::write(videos.join("video-4.gif"), "").unwrap();
         fs::create_dir(videos.join("video-5.mp4.frames")).unwrap();
@@ -223,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn videos_show_what_is_asked_for() {
+    fn arguments_contain_the_requested_options() {
         let of = |scene: Option<&Scene>, video: &VideoRequest| -> Vec<String> {
             let all = arguments("run".as_ref(), scene, video, "video-1.json".as_ref(), "video-1.gif".as_ref());
             all.into_iter().map(|argument| argument.into_string().unwrap()).collect()
@@ -245,7 +246,7 @@ mod tests {
         assert_eq!(of(None, &VideoRequest { skip: Some(Skip::Off), ..video() }), with("--skip", "off"));
     }
 
-    /// Scripts stand in for the program.
+    /// Tests with scripts in place of the program.
     #[cfg(unix)]
     mod scripted {
         use super::*;
@@ -270,11 +271,11 @@ mod tests {
                 Place { folder, video_jobs: Arc::new(VideoJobs::new(run, None, requests)), outbox }
             }
 
-            /// A script: `$8` is the video that it is to write.
+            /// Creates a script. Its argument `$8` is the path of the video.
             fn script(&self, name: &str, text: &str) -> PathBuf {
                 let file = self.folder.path().join(name);
-                // Written by another program: a file that is open for writing here cannot be started, in a process between a fork of
-                // another test's and its start either.
+                // A child process writes the script. A file that is open for writing here cannot be executed, nor while
+                // a child of another test has inherited it.
                 let write = r#"printf '#!/bin/sh\n%s' "$1" > "$2" && chmod 755 "$2""#;
                 let written = Command::new("sh").args(["-c", write, "sh", text]).arg(&file).status().unwrap();
                 assert!(written.success());
@@ -285,7 +286,7 @@ mod tests {
                 self.video_jobs.make(program, &video(), || "gif").map_err(|e| e.to_string())
             }
 
-            /// What pages are told next, and whether that is the last of a video.
+            /// The next message to pages, and whether it is the last one of a video.
             fn told(&self) -> (String, bool) {
                 let start = Instant::now();
                 while start.elapsed() < LONG {
@@ -306,7 +307,7 @@ mod tests {
                 assert_eq!(self.told(), (words.to_owned(), ended));
             }
 
-            /// The files of videos.
+            /// The files in the folder of videos.
             fn videos(&self) -> Vec<String> {
                 let entries = fs::read_dir(self.folder.path().join("videos")).unwrap();
                 let mut names: Vec<_> =
@@ -317,7 +318,7 @@ mod tests {
         }
 
         #[test]
-        fn cancelled_video_keeps_its_place_until_it_ends() {
+        fn cancelled_video_blocks_until_it_ends() {
             let place = Place::new();
             let go = place.folder.path().join("go");
             let first = place.script(
@@ -342,7 +343,7 @@ mod tests {
             fs::write(go, "").unwrap();
             place.tells("cancelled", true);
             assert_eq!(place.videos(), [""; 0], "nothing is left of it");
-            // The next is another's, and goes on.
+            // The second video is another job and continues.
             place.make(&second).unwrap();
             place.tells("started", false);
             assert!(matches!(*place.video_jobs.lock(), Work::Video { .. }));
@@ -376,7 +377,7 @@ mod tests {
             assert!(place.make("other".as_ref()).unwrap_err().contains("the last video stops after its frame"));
             answers.send("gif").unwrap();
             making.join().unwrap();
-            // It was ended before it began.
+            // The video was cancelled before its process started.
             place.tells("started", false);
             place.tells("cancelled", true);
             assert_eq!(place.videos(), [""; 0]);
@@ -397,7 +398,7 @@ mod tests {
         }
 
         #[test]
-        fn what_the_program_says_is_told() {
+        fn follow_reports_program_output() {
             let place = Place::new();
             place.make(&place.script("fails", "echo ' one' >&2\necho two >&2\nexit 1")).unwrap();
             for words in ["started", "one", "two"] {

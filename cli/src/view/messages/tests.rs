@@ -16,7 +16,7 @@ fn sized(width: u32, height: u32) -> View {
     }
 }
 
-/// As a page asks for it.
+/// The JSON request of a view.
 fn asked(view: &View) -> Value {
     let eye = match &view.eye {
         Eye::Free { pose, fov } => json!({ "free": { "pose": pose, "fov": fov } }),
@@ -26,8 +26,8 @@ fn asked(view: &View) -> Value {
 }
 
 #[test]
-fn a_view_has_the_camera_that_is_asked_for() {
-    // Looks along +y from (0, -4, 1), half a unit to the right.
+fn view_camera_follows_the_request() {
+    // Looks along +y from (0, -4, 1), shifted by half a unit to the right.
     let pose = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 1.0]];
     let camera = View::camera(&pose, 90.0, [40, 20]);
     assert_eq!([camera.width, camera.height], [40, 20]);
@@ -36,14 +36,14 @@ fn a_view_has_the_camera_that_is_asked_for() {
     assert!(camera.ray(20.0, 0.0).direction.abs_diff_eq(DVec3::new(0.0, 0.5_f64.sqrt(), 0.5_f64.sqrt()), 1e-12));
     let same = rows(&camera.pose).iter().flatten().zip(pose.iter().flatten()).all(|(a, b)| (a - b).abs() < 1e-12);
     assert!(same, "{camera:?}");
-    // Three digits of a rotation are enough, and it is one.
+    // A rotation with three digits is made exact.
     let rough = [[0.866, -0.5, 0.0, 0.0], [0.5, 0.866, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
     let turn = View::camera(&rough, 50.0, [8, 8]).pose.matrix3;
     assert!((turn.transpose() * turn).abs_diff_eq(DMat3::IDENTITY, 1e-12) && (turn.determinant() - 1.0).abs() < 1e-12);
 }
 
 #[test]
-fn what_is_asked_for_is_read() {
+fn read_valid_messages_succeeds() {
     let read = |message: Value| ClientMessage::read(&message.to_string()).unwrap();
     assert_eq!(read(json!({ "ask": "seen", "id": 4_294_967_295_u32 })), ClientMessage::Seen { id: u32::MAX });
     assert_eq!(read(json!({ "ask": "photograph", "number": 3 })), ClientMessage::Photograph { number: 3 });
@@ -52,7 +52,7 @@ fn what_is_asked_for_is_read() {
     assert_eq!(read(json!({ "ask": "share", "share": 0.9 })), ClientMessage::Share { share: 0.9 });
     let mut view = View { eye: Eye::Free { pose: POSE, fov: 170.0 }, ..sized(9, 7) };
     assert_eq!(read(json!({ "ask": "save", "view": asked(&view) })), ClientMessage::Save { view: view.clone() });
-    // At the ends of what there is.
+    // Values at the limits.
     view.eye = Eye::Free { pose: [[1.0, 0.0, 0.0, 1e9], [0.0, 1.0, 0.0, -1e9], [0.0, 0.0, 1.0, 0.0]], fov: 1.0 };
     (view.compared, view.crop) = (true, Some([[-1e9; 3], [1e9; 3]]));
     assert_eq!(
@@ -64,7 +64,7 @@ fn what_is_asked_for_is_read() {
 }
 
 #[test]
-fn what_is_no_message_is_refused_with_the_reason() {
+fn read_invalid_messages_gives_the_reason() {
     let view = asked(&sized(16, 16));
     let ask = |view: &Value| json!({ "ask": "view", "id": 1, "view": view });
     let changed = |name: &str, value: Value| {
@@ -111,13 +111,13 @@ fn what_is_no_message_is_refused_with_the_reason() {
         let reason = ClientMessage::read(&message).unwrap_err();
         assert!(reason.contains(expected) && !reason.is_empty(), "{message}: {reason}");
     }
-    // It is said in one line.
+    // The reason has one line.
     let reason = ClientMessage::read(r#"{ "ask": "one\nof\u0007two" }"#).unwrap_err();
     assert!(reason.contains("one of two"), "{reason}");
 }
 
 #[test]
-fn pictures_have_so_many_pixels_and_no_more() {
+fn view_with_too_many_pixels_is_refused() {
     for [width, height] in [[1, 1], [4096, 1], [1, 4096], [2048, 2048], [4096, 1024], [1024, 4096]] {
         assert_eq!(sized(width, height).check(), Ok(()), "{width}x{height}");
     }
@@ -130,7 +130,7 @@ fn pictures_have_so_many_pixels_and_no_more() {
 }
 
 #[test]
-fn videos_have_so_many_pixels_and_no_more() {
+fn video_with_too_many_pixels_is_refused() {
     let video = |[width, height]: [u32; 2], seconds: f64, fps: f64| -> Result<Result<(), String>, String> {
         let path = json!({ "render_width": width, "render_height": height, "seconds": seconds, "fps": fps });
         match ClientMessage::read(&json!({ "ask": "video", "path": path }).to_string())? {
@@ -138,7 +138,7 @@ fn videos_have_so_many_pixels_and_no_more() {
             other => panic!("{other:?}"),
         }
     };
-    // The last has 2^34 in all.
+    // The last one has exactly 2^34 pixels.
     for (size, seconds, fps) in [
         ([640, 480], 600.0, 60.0),
         ([4096, 1], 0.0, 0.0),
@@ -175,7 +175,7 @@ fn videos_have_so_many_pixels_and_no_more() {
 }
 
 #[test]
-fn photographs_come_in_the_size_that_is_asked_for() {
+fn at_size_image_has_the_requested_size() {
     let photo =
         Photo::from(Image { width: 4, height: 2, channels: 3, data: (0..24).map(|i| i as f32 / 24.0).collect() });
     assert_eq!(at_size(&photo, [4, 2], [0.0; 3]), photo.over([0.0; 3]));
@@ -186,13 +186,13 @@ fn photographs_come_in_the_size_that_is_asked_for() {
 }
 
 #[test]
-fn pages_are_told_in_json() {
+fn server_messages_are_json() {
     let told = text(&ServerMessage::Sorry { what: "it is lost".to_owned() });
     assert_eq!(told, r#"{"tell":"sorry","what":"it is lost"}"#);
 }
 
 #[test]
-fn a_file_comes_after_what_is_said_of_it() {
+fn file_message_has_header_then_file() {
     let message = File::Photograph { number: 3 }.message(&[9, 8]);
     let length = u32::from_le_bytes(message[..4].try_into().unwrap()) as usize;
     let head: Value = serde_json::from_slice(&message[4..4 + length]).unwrap();

@@ -5,7 +5,7 @@ use crate::view::requests::Outbox;
 use crate::view::row_tiles::tests::{fog, free};
 
 #[test]
-fn what_was_slow_lately_is_expected_to_be_slower() {
+fn expected_rate_is_the_geometric_mean() {
     let rates = [expected(1e5, 4e5), expected(1e5, 1e5), expected(1e5, 1e3), speed(300, Duration::from_millis(20))];
     for (rate, wanted) in rates.into_iter().zip([2e5, 1e5, 1e4, 1.5e4]) {
         assert!((rate / wanted - 1.0).abs() < 1e-12, "{rate} {wanted}");
@@ -13,13 +13,13 @@ fn what_was_slow_lately_is_expected_to_be_slower() {
 }
 
 #[test]
-fn what_rests_is_seen_finer_or_again() {
+fn sync_resting_job_restarts_when_due() {
     let requests = Arc::new(Requests::default());
     let (client, _outbox) = requests.join(1).unwrap();
     let view = json!({ "eye": { "photograph": 0 }, "size": [800, 800], "show": "color" });
     requests.wish(client, 1, serde_json::from_value(view).unwrap());
     let long_ago = Instant::now().checked_sub(2 * AGAIN).unwrap();
-    // How a picture that was seen at step 7 goes on: its halvings, if it does.
+    // Halvings of the next render of a view that was rendered at step 7, if there is one.
     let goes_on = |halvings: u32, when: Instant, spent: Duration, step: u64| {
         let mut renderer = Renderer::new(requests.clone(), None, None);
         renderer.sync(7);
@@ -30,23 +30,23 @@ fn what_rests_is_seen_finer_or_again() {
         job.whole.is_none().then_some(job.halvings)
     };
     let none = Duration::ZERO;
-    // Held, ever finer to the whole; of what has learned more, what half a second is enough for.
+    // A paused model gives finer renders up to full size. A changed model gives the size for half a second.
     assert_eq!([3, 1, 0].map(|halvings| goes_on(halvings, long_ago, none, 7)), [Some(2), Some(0), None]);
     assert_eq!([3, 0].map(|halvings| goes_on(halvings, long_ago, none, 8)), [Some(2), Some(2)]);
-    // Not at once, nor what took longer than that.
+    // No restart before the interval has passed, nor after a render that took longer than that.
     assert_eq!([7, 8].map(|step| goes_on(3, Instant::now(), none, step)), [None, None]);
     assert_eq!([7, 8].map(|step| goes_on(3, long_ago, 4 * AGAIN, step)), [None, None]);
 }
 
 #[test]
-fn what_is_quick_or_stands_still_gets_finer() {
-    // Of a model that stands still, to the whole; of one that learns, what there is time for soon.
+fn finer_for_paused_or_fast_models() {
+    // A paused model reaches full size. A model in training stops at the size for the interval.
     let all = [(3, true, 5), (1, true, 0), (0, true, 0), (3, false, 2), (3, false, 3), (3, false, 5), (0, false, 0)];
     let expected = [Some(2), Some(0), None, Some(2), None, None, None];
     assert_eq!(all.map(|(halvings, is_still, soon)| finer(halvings, is_still, soon)), expected);
 }
 
-/// A renderer of one page that wants to see this, and what that page gets.
+/// A renderer with one page that requests this view, and the page's outbox.
 fn renderer(view: View) -> (Renderer, u64, Arc<Outbox>) {
     let requests = Arc::new(Requests::default());
     let (client, outbox) = requests.join(9).unwrap();
@@ -62,7 +62,7 @@ fn text(outbox: &Outbox) -> String {
 }
 
 #[test]
-fn large_pictures_are_painted_a_few_at_a_time() {
+fn prepare_limits_large_renders() {
     let (mut renderer, _, _) = renderer(free(0.0, [1100, 1000]));
     for x in 1..5 {
         let (client, _) = renderer.requests.join(9).unwrap();
@@ -75,7 +75,7 @@ fn large_pictures_are_painted_a_few_at_a_time() {
     assert_eq!(begun(&mut renderer), [true, true, true, true, false]);
     renderer.jobs[1].begin(0);
     assert!(renderer.prepare(4, &model, 0).is_some() && renderer.prepare(1, &model, 0).is_none());
-    // One that is small has room beside them.
+    // A small render does not count towards the limit.
     let (client, _) = renderer.requests.join(9).unwrap();
     renderer.requests.wish(client, 1, free(9.0, [1024, 1024]));
     renderer.sync(0);
@@ -85,7 +85,7 @@ fn large_pictures_are_painted_a_few_at_a_time() {
 }
 
 #[test]
-fn what_cannot_be_seen_is_said_and_the_rest_is_seen() {
+fn work_reports_unavailable_views() {
     let model = fog();
     for (change, expected) in [
         (json!({ "compared": true }), "there is no such image, or the run's images are not available"),
@@ -108,7 +108,7 @@ fn what_cannot_be_seen_is_said_and_the_rest_is_seen() {
 }
 
 #[test]
-fn ping_of_a_frame_names_its_render() {
+fn delivered_frame_describes_its_render() {
     let model = fog();
     let (mut renderer, _, outbox) = renderer(free(0.0, [48, 36]));
     renderer.rates.insert((Show::Color, None), 1e6);
@@ -125,18 +125,18 @@ fn ping_of_a_frame_names_its_render() {
 }
 
 #[test]
-fn what_is_kept_while_a_model_learns_is_of_one_step() {
+fn save_during_training_is_of_one_step() {
     let (mut renderer, client, outbox) = renderer(free(0.0, [8, 8]));
     renderer.requests.rest(client);
     renderer.requests.save(client, free(0.0, [16, 64]));
-    // A row at a time, as far as is known.
+    // A rate so low that each tile has one row.
     renderer.rates.insert((Show::Color, None), 1.0);
     assert!(renderer.work(&fog(), 7));
     assert!(matches!(outbox.take(), Some(Outgoing::Bytes(_))));
 }
 
 #[test]
-fn who_paints_waits_where_there_is_nothing_to_paint() {
+fn work_or_wait_without_jobs_waits() {
     let model = fog();
     let (mut renderer, client, _outbox) = renderer(free(0.0, [8, 8]));
     let took = |renderer: &mut Renderer, most: u64| {
@@ -151,7 +151,7 @@ fn who_paints_waits_where_there_is_nothing_to_paint() {
 }
 
 #[test]
-fn pictures_are_painted_in_turns() {
+fn work_alternates_between_jobs() {
     let requests = Arc::new(Requests::default());
     for number in 0..2 {
         let (client, _outbox) = requests.join(2).unwrap();
@@ -159,26 +159,26 @@ fn pictures_are_painted_in_turns() {
     }
     let model = fog();
     let mut renderer = Renderer::new(requests, None, None);
-    // So slow, as far as is known, that a piece is a row at first, and never all.
+    // A rate so low that the first tile has one row, and no tile is a whole render.
     renderer.rates.insert((Show::Color, None), 1.0);
     let mut turns = vec![];
     for _ in 0..5 {
         assert!(renderer.work(&model, 0));
         turns.push([0, 1].map(|i| renderer.jobs[i].turn));
     }
-    // The second is new when the first has been, but not again before that has had its turn; then one after the other.
+    // The second job is new after the first tile. It waits for another tile of the first job, then both alternate.
     assert_eq!(turns, [[1, 0], [2, 0], [2, 3], [4, 3], [4, 5]]);
 }
 
 #[test]
-fn the_first_picture_is_there_at_once() {
+fn halvings_of_first_render_fit_the_time() {
     for (size, rate) in [([800, 800], 1e5), ([400, 300], 1e6), ([4000, 1000], 3e4)] {
         let times = halvings(size, rate, FIRST);
         let rays = |times: u32| size.map(|side: u32| f64::from(side.div_ceil(1 << times))).iter().product::<f64>();
         assert!(rays(times) <= 1.1 * FIRST * rate || times == MOST_HALVINGS, "{size:?}: {times}");
         assert!(times == 0 || rays(times - 1) > FIRST * rate, "{size:?}: {times}");
     }
-    // Nothing is smaller than a few pixels, and what is quick is whole.
+    // The smallest render has a few pixels. Fast renders have full size.
     let at_once = |size: [u32; 2], rate: f64| halvings(size, rate, FIRST);
     assert_eq!([at_once([8, 8], 1.0), at_once([3, 3000], 1.0), at_once([640, 480], 1e9)], [1, 0, 0]);
     assert_eq!(at_once([800, 800], 1e5), 4, "640 000 rays are 183 times what 35 ms have");

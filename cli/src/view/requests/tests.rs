@@ -21,7 +21,7 @@ fn shot(halvings: u32) -> RenderedFrame {
     RenderedFrame { made: Made { halvings, milliseconds: 1.0, compared: None, step: 0 }, jpeg: vec![halvings as u8] }
 }
 
-/// The last byte of the picture that is sent next.
+/// The last byte of the next render that is sent.
 fn sent(outbox: &Outbox) -> Option<u8> {
     match outbox.take()? {
         Outgoing::Bytes(bytes) => bytes.last().copied(),
@@ -30,7 +30,7 @@ fn sent(outbox: &Outbox) -> Option<u8> {
 }
 
 #[test]
-fn pages_share_a_request_and_the_newest_wins() {
+fn pages_share_a_request_and_get_the_newest() {
     let requests = Requests::default();
     let ([a, b], [from_a, from_b]) = {
         let [(a, out), (b, other)] = [requests.join(9), requests.join(9)].map(Option::unwrap);
@@ -43,7 +43,7 @@ fn pages_share_a_request_and_the_newest_wins() {
     assert!(wishes.len() == 1 && requests.wants(&wishes[0]));
     requests.show(&wishes[0], shot(2));
     assert_eq!([sent(&from_a), sent(&from_b)], [Some(2); 2]);
-    // Until it is seen no other is sent, and then the newest.
+    // The next render is sent after the acknowledgement, and it is the newest one.
     requests.show(&wishes[0], shot(1));
     requests.show(&wishes[0], shot(0));
     assert_eq!(sent(&from_a), None);
@@ -51,12 +51,12 @@ fn pages_share_a_request_and_the_newest_wins() {
     assert_eq!(sent(&from_a), None, "that was another");
     from_a.seen(1);
     assert_eq!([sent(&from_a), sent(&from_a)], [Some(0), None]);
-    // One that comes later gets what there is at once.
+    // A later page gets the existing render at once.
     let (c, from_c) = requests.join(9).unwrap();
     requests.wish(c, 3, view(1));
     assert_eq!(sent(&from_c), Some(0));
     requests.leave(c);
-    // What waits of an old wish is not sent any more.
+    // A waiting render of an old request is dropped.
     requests.wish(b, 10, view(2));
     from_b.seen(9);
     assert_eq!(sent(&from_b), None);
@@ -79,7 +79,7 @@ fn pages_share_a_request_and_the_newest_wins() {
 }
 
 #[test]
-fn a_page_has_so_much_waiting_and_no_more() {
+fn outbox_over_the_limit_is_overrun() {
     let requests = Requests::default();
     let (page, outbox) = requests.join(9).unwrap();
     assert!((0..SAVES).all(|i| requests.save(page, view(i))) && !requests.save(page, view(9)));
@@ -88,7 +88,7 @@ fn a_page_has_so_much_waiting_and_no_more() {
     assert!(requests.save(other, view(0)), "each its own");
     requests.leave(page);
     assert!(requests.next_save().is_some_and(|save| save.client == other) && requests.next_save().is_none());
-    // In the order in which they were asked for; what is painted and not sent counts.
+    // Saves keep their order. Rendered but unsent saves count towards the limit.
     let (third, files) = requests.join(9).unwrap();
     requests.save(third, view(1));
     requests.save(third, view(2));
@@ -98,7 +98,7 @@ fn a_page_has_so_much_waiting_and_no_more() {
     assert!(!requests.save(third, view(3)));
     files.take();
     assert!(requests.save(third, view(3)) && files.files() == SAVES - 1);
-    // Of how training goes, the newest is told.
+    // Only the newest state of training is sent.
     requests.tell_state("one");
     requests.tell_state("two");
     while files.files() > 0 {
@@ -109,7 +109,7 @@ fn a_page_has_so_much_waiting_and_no_more() {
         outbox.post(Outgoing::Text(String::new()));
     }
     assert!(!outbox.is_overrun());
-    // It stays so, and what is too much is not kept.
+    // The overrun is permanent, and excess messages are dropped.
     for _ in 0..2 {
         outbox.post(Outgoing::Bytes(vec![]));
         assert!(outbox.is_overrun() && outbox.files() == 0);
@@ -120,7 +120,7 @@ fn a_page_has_so_much_waiting_and_no_more() {
 }
 
 #[test]
-fn what_waits_of_an_old_wish_is_not_sent() {
+fn render_of_old_request_is_dropped() {
     let requests = Requests::default();
     let (page, outbox) = requests.join(9).unwrap();
     let wish = |id: u32| {
@@ -129,7 +129,7 @@ fn what_waits_of_an_old_wish_is_not_sent() {
         requests.show(&wish, shot(1));
         wish
     };
-    // A picture is under way, and another waits.
+    // One render is unacknowledged, and another one waits.
     wish(1);
     assert_eq!(sent(&outbox), Some(1));
     wish(2);
@@ -139,7 +139,7 @@ fn what_waits_of_an_old_wish_is_not_sent() {
     requests.refuse(&wish(3), "it is lost");
     assert_eq!(outbox.take(), Some(sorry("it is lost")));
     assert_eq!(outbox.take(), None);
-    // Of how long one is under way there is a record until it is seen.
+    // The send time is known until the acknowledgement.
     assert_eq!(outbox.flying(), None);
     let before = Instant::now();
     wish(4);
@@ -153,7 +153,7 @@ fn what_waits_of_an_old_wish_is_not_sent() {
 }
 
 #[test]
-fn who_sends_is_woken_by_all_there_is_to_send() {
+fn outbox_notifies_of_each_message() {
     let requests = Requests::default();
     let (page, outbox) = requests.join(9).unwrap();
     let is_woken = || outbox.changed.notified().now_or_never().is_some();
@@ -176,7 +176,7 @@ fn who_sends_is_woken_by_all_there_is_to_send() {
 }
 
 #[test]
-fn messages_are_for_whom_they_are_for() {
+fn messages_reach_their_pages_only() {
     let requests = Requests::default();
     let [(a, from_a), (b, from_b)] = [requests.join(9), requests.join(9)].map(Option::unwrap);
     assert_ne!(a, b);
@@ -191,7 +191,7 @@ fn messages_are_for_whom_they_are_for() {
     assert_eq!(requests.about(), "a scene");
 }
 
-/// Whether something was asked for since this was called last.
+/// Returns true if something has changed since the last call.
 fn is_news(requests: &Requests) -> bool {
     std::mem::take(&mut requests.lock().news)
 }

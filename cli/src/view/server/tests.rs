@@ -12,9 +12,9 @@ use tungstenite::http::Request;
 use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Message, WebSocket};
 
-/// Nothing takes as long as that.
+/// Longer than any step of a test.
 const LONG: Duration = Duration::from_secs(30);
-/// What a message has that no connection holds while nobody reads it.
+/// Length of a message that exceeds all socket buffers.
 const HUGE: usize = 48 << 20;
 
 fn served_at(host: &str, limits: Limits) -> (String, Arc<Requests>) {
@@ -25,7 +25,7 @@ fn served_at(host: &str, limits: Limits) -> (String, Arc<Requests>) {
     (link.strip_prefix("http://").unwrap().to_owned(), requests)
 }
 
-/// Serves to this machine; gives the address.
+/// Starts a local server and returns its address.
 fn served(limits: Limits) -> (String, Arc<Requests>) {
     let (link, requests) = served_at("127.0.0.1", limits);
     (link.strip_suffix('/').unwrap().to_owned(), requests)
@@ -37,7 +37,7 @@ fn connect(address: &str) -> TcpStream {
     stream
 }
 
-/// What a request by hand is answered: status, head and body.
+/// Sends a raw request and returns status, head and body.
 fn request(address: &str, head: &str) -> (u16, String, String) {
     let mut stream = connect(address);
     stream.write_all(format!("{head}\r\nConnection: close\r\n\r\n").as_bytes()).unwrap();
@@ -47,7 +47,7 @@ fn request(address: &str, head: &str) -> (u16, String, String) {
     (head.split(' ').nth(1).unwrap().parse().unwrap(), head.to_lowercase(), body.to_owned())
 }
 
-/// One that asks to be a page, from such a one or none, and what it is answered.
+/// Sends a WebSocket upgrade request with this origin and returns the status.
 fn upgraded(address: &str, path: &str, origin: Option<&str>) -> (TcpStream, String) {
     let origin = origin.map(|origin| format!("Origin: {origin}\r\n")).unwrap_or_default();
     let head = format!(
@@ -62,12 +62,12 @@ fn upgraded(address: &str, path: &str, origin: Option<&str>) -> (TcpStream, Stri
     (stream, status)
 }
 
-/// The same, of a page.
+/// Like [`upgraded`], with the origin of a page.
 fn joined(address: &str) -> (TcpStream, String) {
     upgraded(address, "/messages", Some(&format!("http://{address}")))
 }
 
-/// Waits until something is so.
+/// Waits until the condition holds.
 #[track_caller]
 fn becomes(mut so: impl FnMut() -> bool) {
     let start = Instant::now();
@@ -77,7 +77,7 @@ fn becomes(mut so: impl FnMut() -> bool) {
     }
 }
 
-/// A page without a browser.
+/// A test client of the WebSocket.
 struct Client {
     socket: WebSocket<TcpStream>,
     opened: Instant,
@@ -90,7 +90,7 @@ impl Client {
         page
     }
 
-    /// One that has not read anything.
+    /// Connects without reading a message.
     fn connect(address: &str) -> Self {
         let request = Request::builder().uri(format!("ws://{address}/messages"));
         let request = request.header("Host", address).header("Origin", format!("http://{address}"));
@@ -107,7 +107,7 @@ impl Client {
         self.socket.send(Message::text(message.to_string())).unwrap();
     }
 
-    /// What comes next; why the connection has ended, if it has.
+    /// The next message, or the reason for the end of the connection.
     #[track_caller]
     fn read(&mut self) -> Result<Message, String> {
         assert!(self.opened.elapsed() < 2 * LONG, "there is no end");
@@ -118,7 +118,7 @@ impl Client {
         }
     }
 
-    /// The next of text.
+    /// The next text message.
     #[track_caller]
     fn text(&mut self) -> Value {
         loop {
@@ -128,7 +128,7 @@ impl Client {
         }
     }
 
-    /// How many messages of bytes come until the program ends the connection, and why it does.
+    /// Reads up to the end of the connection. Returns the number of binary messages and the reason for the end.
     #[track_caller]
     fn closed(&mut self) -> (usize, String) {
         let mut files = 0;
@@ -166,14 +166,14 @@ fn server_refuses_other_hosts_and_other_paths() {
         }
     };
     told(&head);
-    // What it is, and how long, is said without it, too.
+    // HEAD returns the type and the length.
     let (status, head, body) = request(&address, &format!("HEAD / HTTP/1.1\r\nHost: {address}"));
     assert!(status == 200 && body.is_empty(), "{head}");
     assert!(
         head.contains("content-type: text/html") && head.contains(&format!("content-length: {}", page.len())),
         "{head}"
     );
-    // Nothing on it is from elsewhere.
+    // The files load nothing from other sites.
     for (file, kind) in [("/", "html"), ("/view.css", "css"), ("/camera.js", "javascript"), ("/view.js", "javascript")]
     {
         let (status, head, body) = request(&address, &format!("GET {file} HTTP/1.1\r\nHost: localhost:{port}"));
@@ -206,21 +206,21 @@ fn server_refuses_other_hosts_and_other_paths() {
     for origin in [None, Some("http://evil.example"), Some("http://127.0.0.1:1"), Some("null")] {
         assert_eq!(upgraded(&address, "/messages", origin).1, "403", "{origin:?}");
     }
-    // What asks at length is not read.
+    // A long request head is refused.
     let long = format!("GET / HTTP/1.1\r\nHost: {address}\r\nX-Long: {}", "x".repeat(8000));
     assert_eq!(request(&address, &long).0, 200);
     assert_eq!(request(&address, &(long + &"x".repeat(2 * HEAD))).0, 431);
 }
 
 #[test]
-fn others_come_with_the_token_alone() {
+fn server_on_all_addresses_needs_the_token() {
     let (link, requests) = served_at("0.0.0.0", Limits::USUAL);
     let (host, token) = link.split_once("/?token=").unwrap();
     assert!(token.len() == 32 && token.bytes().all(|byte| byte.is_ascii_hexdigit()), "{token}");
     let address = format!("127.0.0.1:{}", host.rsplit(':').next().unwrap());
     let status = |path: &str| request(&address, &format!("GET {path} HTTP/1.1\r\nHost: {address}")).0;
     assert_eq!(status(&format!("/?token={token}")), 200);
-    // Style and script are no secret.
+    // Style sheet and scripts need no token.
     assert_eq!(["/view.css", "/camera.js", "/view.js"].map(status), [200; 3]);
     let other = |digit: char| if digit == '0' { '1' } else { '0' };
     let near = format!("{}{}", &token[..31], other(token.chars().last().unwrap()));
@@ -235,27 +235,27 @@ fn others_come_with_the_token_alone() {
     );
     assert_eq!(upgraded(&address, &format!("/messages?token={token}"), None).1, "403");
     becomes(|| requests.connected() == 0);
-    // By a name it is not served, as nobody has said which it has.
+    // Unknown host names are refused, as no name was given.
     let (status, _, body) = request(&address, &format!("GET /?token={token} HTTP/1.1\r\nHost: box.lan"));
     assert!(status == 421 && body.contains("--host NAME"), "{body}");
 }
 
 #[test]
-fn links_lead_where_it_listens() {
+fn link_uses_a_reachable_address() {
     let of = |address: &str, host, outward: Option<&str>, token| {
         link(address.parse().unwrap(), host, outward.map(|ip| ip.parse().unwrap()), token)
     };
     assert_eq!(of("127.0.0.1:7007", "localhost", None, None), "http://127.0.0.1:7007/");
     assert_eq!(of("[::1]:80", "::1", Some("10.0.0.2"), None), "http://[::1]:80/");
     assert_eq!(of("10.0.0.2:80", "box.lan", Some("10.0.0.3"), Some("abc")), "http://box.lan:80/?token=abc");
-    // One that can be followed from elsewhere, if there is a network.
+    // The outward address, if there is a network.
     assert_eq!(of("0.0.0.0:80", "0.0.0.0", Some("10.0.0.2"), Some("abc")), "http://10.0.0.2:80/?token=abc");
     assert_eq!(of("[::]:80", "::", Some("2001:db8::2"), None), "http://[2001:db8::2]:80/");
     assert_eq!(of("0.0.0.0:80", "0.0.0.0", None, None), "http://0.0.0.0:80/");
 }
 
 #[test]
-fn it_goes_out_by_an_address_of_its_own() {
+fn outward_gives_the_local_address() {
     let ip = |text: &str| text.parse::<IpAddr>().unwrap();
     assert_eq!(outward(ip("0.0.0.0"), "127.0.0.1:9"), Some(ip("127.0.0.1")));
     assert_eq!(outward(ip("127.0.0.1"), "nothing"), None);
@@ -269,7 +269,7 @@ fn it_goes_out_by_an_address_of_its_own() {
 fn malformed_message_closes_its_connection() {
     let (address, requests) = served(Limits { rate: 0.0, burst: 3.0, ..Limits::USUAL });
     let mut good = Client::open(&address);
-    // Reasons end with a letter, however long these are.
+    // Long reasons are cut at a character.
     let long = json!({ "ask": "\u{e4}".repeat(100) }).to_string();
     for (message, expected) in [
         (Message::text("{"), "EOF"),
@@ -282,7 +282,7 @@ fn malformed_message_closes_its_connection() {
         let (_, reason) = page.closed();
         assert!(reason.contains(expected) && reason.len() <= 123, "{message:?}: {reason}");
     }
-    // As many as may come at once, and one more.
+    // The largest burst, and one message more.
     let mut page = Client::open(&address);
     for _ in 0..3 {
         page.say(&json!({ "ask": "end-video" }));
@@ -290,7 +290,7 @@ fn malformed_message_closes_its_connection() {
     page.say(&json!({ "ask": "share", "share": 0.5 }));
     assert_eq!(page.closed().1, "too many messages");
     assert_eq!(requests.share(), 0.0, "the last one is not seen to");
-    // The others are still served, and three are not too many.
+    // Other pages are still served, and three messages are within the limit.
     becomes(|| requests.connected() == 1);
     for share in [0.25, 0.5, 0.75] {
         good.say(&json!({ "ask": "share", "share": share }));
@@ -302,7 +302,7 @@ fn malformed_message_closes_its_connection() {
 }
 
 #[test]
-fn a_message_is_so_long_and_no_longer() {
+fn message_over_the_limit_closes_the_page() {
     let (address, requests) = served(Limits::USUAL);
     let message = json!({ "ask": "share", "share": 0.5 }).to_string();
     let mut page = Client::open(&address);
@@ -317,7 +317,7 @@ fn a_message_is_so_long_and_no_longer() {
 
 #[test]
 fn server_limits_the_number_of_pages() {
-    // Connections are for those that are no pages yet.
+    // A page does not occupy a connection permit.
     let silence = Duration::from_millis(400);
     let (address, requests) = served(Limits { pages: 3, connections: 1, silence, ..Limits::USUAL });
     let start = Instant::now();
@@ -332,7 +332,7 @@ fn server_limits_the_number_of_pages() {
         pages.extend(is_in.then_some(page));
         is_in
     });
-    // Those that say nothing at all, not even that they are there, are taken to be gone.
+    // Pages that answer no pings count as gone.
     becomes(|| requests.connected() == 0);
     assert!(start.elapsed() >= silence);
 }
@@ -352,7 +352,7 @@ fn idle_page_is_pinged_and_stays() {
             pings += 1;
             assert!(start.elapsed() >= pings * idle, "{pings}");
         } else {
-            // It is told how it goes meanwhile.
+            // Messages to the page do not delay pings.
             std::thread::sleep(Duration::from_millis(20));
             requests.tell_state("{}");
         }
@@ -362,7 +362,7 @@ fn idle_page_is_pinged_and_stays() {
 }
 
 #[test]
-fn who_is_slow_is_not_gone_in_the_middle_of_a_message() {
+fn slow_page_is_kept_during_a_long_message() {
     let silence = Duration::from_millis(200);
     let (address, requests) = served(Limits { silence, ..Limits::USUAL });
     requests.introduce("x".repeat(HUGE));
@@ -386,10 +386,10 @@ fn unread_messages_time_out() {
 }
 
 #[test]
-fn who_asks_for_too_much_is_told() {
+fn overrun_page_gets_the_reason() {
     let (address, requests) = served(Limits::USUAL);
     let mut page = Client::open(&address);
-    // Nothing is sent before this has gone, however quick the other side is.
+    // This message exceeds the socket buffers, so that all others wait.
     requests.tell(&Outgoing::Bytes(vec![7; HUGE]));
     for _ in 0..100 {
         requests.tell(&text(&crate::view::messages::ServerMessage::Sorry { what: String::new() }));
@@ -411,7 +411,7 @@ fn view() -> View {
 }
 
 #[test]
-fn a_page_that_takes_no_picture_is_dropped() {
+fn unacknowledged_render_closes_the_page() {
     let patience = Duration::from_secs(1);
     let (address, requests) = served(Limits { patience, ..Limits::USUAL });
     let mut page = Client::open(&address);
@@ -422,7 +422,7 @@ fn a_page_that_takes_no_picture_is_dropped() {
         let made = Made { halvings, milliseconds: 1.0, compared: None, step: 0 };
         requests.show(&requests.wishes()[0], RenderedFrame { made, jpeg: vec![7; 9] });
     };
-    // One that takes them stays, for longer than it may take.
+    // A page with acknowledgements stays longer than the time-out.
     let start = Instant::now();
     for halvings in (0..3).rev() {
         show(halvings);
@@ -452,7 +452,7 @@ fn silent_connections_time_out() {
 }
 
 #[test]
-fn connections_that_are_no_pages_end_after_a_while() {
+fn connection_without_upgrade_times_out() {
     let (address, _) = served(Limits { connected: Duration::from_millis(200), patience: 2 * LONG, ..Limits::USUAL });
     let mut stream = connect(&address);
     stream.write_all(format!("GET /nothing HTTP/1.1\r\nHost: {address}\r\n\r\n").as_bytes()).unwrap();
