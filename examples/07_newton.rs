@@ -80,7 +80,7 @@ fn main() {
         }
         x += &(h * &direction);
     }
-    let farthest = x.distance(&Tensor::ones(x.shape()));
+    let farthest = x.max_abs_diff(&Tensor::ones(x.shape()));
     println!("  all variables are 1 within {farthest:.0e}");
     assert!(farthest < 1e-6, "another minimum, or none");
 

@@ -5,7 +5,7 @@
 //! cargo run --release --example fit_image [folder for the picture]
 //! ```
 //!
-//! Takes about half a minute. It uses the tape, layers and optimiser of `raygrad` directly: nothing here is
+//! Takes about half a minute. It uses the tape, layers and optimizer of `raygrad` directly: nothing here is
 //! special to NeRF but the encoding itself.
 
 use rand::rngs::StdRng;

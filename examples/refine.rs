@@ -108,7 +108,7 @@ fn main() -> Result<()> {
         None => Budget::Time(Duration::from_secs_f64(number("seconds", 60.0))),
     };
     let plain = Config::preset(Preset::Instant).for_budget(budget.samples(), right.pixels_per_side());
-    let mut plain = plain.with_scene_type(right.scope);
+    let mut plain = plain.with_scene_type(right.scene_type);
     if !right.has_alpha() {
         plain.background = Background::White;
     }

@@ -162,7 +162,7 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
     alone.add("table", model.params.get(id).clone());
     alone.set_lazy(|_| true, true);
     let (mut adam, mut moved) = (Adam::new(model.config.table_adam), 0);
-    let update = least(|| moved = adam.update(&mut alone, std::slice::from_ref(&grad), 1e-3).moved / grid.features());
+    let update = least(|| moved = adam.update(&mut alone, std::slice::from_ref(&grad), 1e-3).updated / grid.features());
     let size = 4 * model.params.get(id).len();
 
     let (matrix, line) = (matrix_rate(), line_rate(size));

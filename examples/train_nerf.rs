@@ -29,7 +29,7 @@ fn main() -> Result<()> {
     println!("{} photographs to train on, {} to test", train.frames.len(), test.frames.len());
     let (near, far) = (test.near, test.far);
 
-    // A model and its optimiser. Every number of the preset can be changed before this.
+    // A model and its optimizer. Every number of the preset can be changed before this.
     let mut trainer = Trainer::new(Config::preset(Preset::Small), Arc::new(train))?;
     println!("{} parameters", trainer.model.params.elements());
 

@@ -67,7 +67,7 @@ fn main() -> Result<()> {
         if leave_out || argument("only").is_some_and(|only| only != name) {
             continue;
         }
-        let data = Dataset { scope, ..train.clone() };
+        let data = Dataset { scene_type: scope, ..train.clone() };
         let mut config = usual.clone().for_budget(budget.samples(), data.pixels_per_side()).with_scene_type(scope);
         if name == "contraction" {
             let proposal = ProposalConfig { spacing: Spacing::Disparity, ..ProposalConfig::default() };

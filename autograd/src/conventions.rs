@@ -177,7 +177,7 @@ mod tests {
             "gelu_tanh(x)" => a.gelu_tanh(),
             "silu(x)" => a.silu(),
             "tanh(x)" => a.tanh(),
-            "binary_cross_entropy(a, b)" => a.binary_cross_entropy(b),
+            "binary_cross_entropy(a, b)" => a.binary_cross_entropy_with_logits(b),
             _ => return None,
         })
     }

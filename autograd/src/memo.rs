@@ -8,11 +8,11 @@ use raygrad_tensor::{Pool, Scalar, Tensor};
 
 /// Saved outputs of the [cacheable](Op::is_cacheable) operations of a pass, in the order in which they ran.
 #[derive(Debug, Clone)]
-pub struct Memo<T: Scalar> {
+pub struct CachedOutputs<T: Scalar> {
     values: Vec<Tensor<T>>,
 }
 
-impl<T: Scalar> Memo<T> {
+impl<T: Scalar> CachedOutputs<T> {
     /// The outputs, in order.
     pub fn values(&self) -> &[Tensor<T>] {
         &self.values
@@ -24,8 +24,8 @@ impl<T: Scalar> Memo<T> {
     /// # Panics
     /// If the memos are not of the same operations, an output is a scalar, or a row is out of range.
     #[track_caller]
-    pub fn gather(memos: &[Memo<T>], rows: &[[u32; 2]], pool: &Pool<T>) -> Memo<T> {
-        let Some(first) = memos.first() else { return Memo { values: vec![] } };
+    pub fn gather(memos: &[CachedOutputs<T>], rows: &[[u32; 2]], pool: &Pool<T>) -> CachedOutputs<T> {
+        let Some(first) = memos.first() else { return CachedOutputs { values: vec![] } };
         let gather = |which: usize| {
             let parts: Vec<&[T]> = memos.iter().map(|memo| memo.values[which].as_slice()).collect();
             let mut shape = first.values[which].shape().to_vec();
@@ -39,21 +39,21 @@ impl<T: Scalar> Memo<T> {
             out
         };
         let row = |value: &Tensor<T>| value.shape().get(1..).map(<[usize]>::to_vec);
-        let alike = |memo: &Memo<T>| memo.values.iter().map(row).eq(first.values.iter().map(row));
+        let alike = |memo: &CachedOutputs<T>| memo.values.iter().map(row).eq(first.values.iter().map(row));
         assert!(memos.iter().all(alike), "memos of the same operations");
-        Memo { values: (0..first.values.len()).map(gather).collect() }
+        CachedOutputs { values: (0..first.values.len()).map(gather).collect() }
     }
 }
 
 impl<T: Scalar> Tape<T> {
     /// Runs `f`, and returns its result and the outputs of its [cacheable](Op::is_cacheable) operations, for
     /// [`reuse_outputs`](Self::reuse_outputs).
-    pub fn cache_outputs<R>(&self, f: impl FnOnce() -> R) -> (R, Memo<T>) {
-        let (result, values) = with_cell(&self.remembered, Some(vec![]), f);
+    pub fn cache_outputs<R>(&self, f: impl FnOnce() -> R) -> (R, CachedOutputs<T>) {
+        let (result, values) = with_cell(&self.cached, Some(vec![]), f);
         let values = values.unwrap_or_default();
         // An enclosing `cache_outputs` saves these outputs too.
-        values.iter().for_each(|value| self.keep(value));
-        (result, Memo { values })
+        values.iter().for_each(|value| self.cache(value));
+        (result, CachedOutputs { values })
     }
 
     /// Runs `f`, whose [cacheable](Op::is_cacheable) operations take their outputs from `memo` instead of computing
@@ -90,31 +90,31 @@ impl<T: Scalar> Tape<T> {
     /// If `f` runs fewer or other cacheable operations than those of the memo; other operations are found by their
     /// shapes. An empty memo is ignored: all outputs are computed.
     #[track_caller]
-    pub fn reuse_outputs<R>(&self, memo: Memo<T>, f: impl FnOnce() -> R) -> R {
+    pub fn reuse_outputs<R>(&self, memo: CachedOutputs<T>, f: impl FnOnce() -> R) -> R {
         if memo.values.is_empty() {
             return f();
         }
-        let (result, left) = with_cell(&self.recalled, Some(memo.values.into_iter()), f);
+        let (result, left) = with_cell(&self.reused, Some(memo.values.into_iter()), f);
         assert_eq!(left.map_or(0, |left| left.len()), 0, "outputs of a memo that no operation asked for");
         result
     }
 
     /// The output of an operation from the memo, if one is in use.
     #[track_caller]
-    pub(crate) fn recalled(&self, op: &'static str, shape: &[usize]) -> Option<Tensor<T>> {
-        let mut values = self.recalled.take()?;
+    pub(crate) fn reuse(&self, op: &'static str, shape: &[usize]) -> Option<Tensor<T>> {
+        let mut values = self.reused.take()?;
         let value = values.next();
-        self.recalled.set(Some(values));
+        self.reused.set(Some(values));
         let value = value.unwrap_or_else(|| panic!("{op}: a memo that ends before this operation"));
         assert_eq!(value.shape(), shape, "{op}: a memo holds an output of another shape for it");
         Some(value)
     }
 
     /// Saves an output, if outputs are being saved.
-    pub(crate) fn keep(&self, value: &Tensor<T>) {
-        if let Some(mut values) = self.remembered.take() {
+    pub(crate) fn cache(&self, value: &Tensor<T>) {
+        if let Some(mut values) = self.cached.take() {
             values.push(value.clone());
-            self.remembered.set(Some(values));
+            self.cached.set(Some(values));
         }
     }
 }
@@ -163,14 +163,14 @@ mod tests {
         let (_, b) = tape.no_grad(|| tape.cache_outputs(|| run(&x.gather_rows([1]), &count)));
         assert!(a.values().len() == 2 && !first.is_on_graph() && count.load(Ordering::Relaxed) == 4);
         // Rows 0 and 1, which are the second of the first memo and the only one of the second.
-        let memo = Memo::gather(&[a, b], &[[0, 1], [1, 0]], tape.pool());
+        let memo = CachedOutputs::gather(&[a, b], &[[0, 1], [1, 0]], tape.pool());
         let seen = tape.reuse_outputs(memo, || run(&x.gather_rows([0, 1]), &count));
         assert_eq!((seen.value(), count.load(Ordering::Relaxed)), (&Tensor::from([[5.0, 9.0], [13.0, 17.0]]), 4));
         assert_eq!(seen.sum().grad(&[&x])[0], [[4.0, 4.0], [4.0, 4.0], [0.0, 0.0]]);
         // Afterwards everything is as it was.
         run(&x, &count);
         assert_eq!(count.load(Ordering::Relaxed), 6);
-        tape.reuse_outputs(Memo::gather(&[], &[], tape.pool()), || run(&x, &count));
+        tape.reuse_outputs(CachedOutputs::gather(&[], &[], tape.pool()), || run(&x, &count));
         assert_eq!(count.load(Ordering::Relaxed), 8);
     }
 
@@ -190,7 +190,7 @@ mod tests {
         let tape = Tape::new();
         let x = tape.leaf(Tensor::scalar(1.0));
         let (_, memo) = tape.cache_outputs(|| run(&x, &Arc::default()));
-        Memo::gather(&[memo], &[[0, 0]], tape.pool());
+        CachedOutputs::gather(&[memo], &[[0, 0]], tape.pool());
     }
 
     #[test]

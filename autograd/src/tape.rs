@@ -35,8 +35,8 @@ pub struct Tape<T: Scalar> {
     /// While a method that consists of several operations runs: the line of the user's code that called it.
     within: Cell<Option<&'static Location<'static>>>,
     /// Outputs being saved, and outputs being reused ([`crate::Memo`]).
-    pub(crate) remembered: Cell<Option<Vec<Tensor<T>>>>,
-    pub(crate) recalled: Cell<Option<std::vec::IntoIter<Tensor<T>>>>,
+    pub(crate) cached: Cell<Option<Vec<Tensor<T>>>>,
+    pub(crate) reused: Cell<Option<std::vec::IntoIter<Tensor<T>>>>,
 }
 
 /// One recorded operation, or a leaf. [`Nodes`] holds the edges to its inputs.
@@ -77,8 +77,8 @@ impl<T: Scalar> Tape<T> {
             trying: Cell::new(false),
             differentiating: Cell::new(None),
             within: Cell::new(None),
-            remembered: Cell::default(),
-            recalled: Cell::default(),
+            cached: Cell::default(),
+            reused: Cell::default(),
         }
     }
 
@@ -314,7 +314,7 @@ impl<T: Scalar> Tape<T> {
     #[track_caller]
     fn run(&self, op: &dyn Op<T>, inputs: &[&Var<'_, T>], at: &'static Location<'static>) -> Result<Tensor<T>, Error> {
         let shape = self.check_shapes(op, inputs, at)?;
-        let recalled = if op.is_cacheable() { self.recalled(op.name(), &shape) } else { None };
+        let recalled = if op.is_cacheable() { self.reuse(op.name(), &shape) } else { None };
         let value = recalled.unwrap_or_else(|| {
             let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| &x.value).collect();
             op.forward(&values, &self.pool)
@@ -322,7 +322,7 @@ impl<T: Scalar> Tape<T> {
         assert_eq!(value.shape(), shape.as_slice(), "{}: `forward` and `shape` disagree", op.name());
         self.check_output(op.name(), inputs, &value, at)?;
         if op.is_cacheable() {
-            self.keep(&value);
+            self.cache(&value);
         }
         Ok(value)
     }

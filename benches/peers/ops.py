@@ -77,7 +77,7 @@ def single_operations(args):
     for what, f, x in cases:
         x = x.clone().requires_grad_()
         seconds, _ = measure.timed(lambda: torch.autograd.grad(f(x).sum(), x), args.repeats, args.warmup)
-        # The gradient of a sum is one number seen through strides of 0; `.backward()` and optimisers write it out.
+        # The gradient of a sum is one number seen through strides of 0; `.backward()` and optimizers write it out.
         written = lambda: torch.autograd.grad(f(x).sum(), x)[0].contiguous()
         seconds_written, _ = measure.timed(written, args.repeats, args.warmup)
         report(args, what, seconds_forward_backward=seconds, seconds_with_gradient_written=seconds_written)

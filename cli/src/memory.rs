@@ -7,7 +7,7 @@ use super::machine;
 
 /// Bytes of the program itself: code, threads, and initialisation in the first step.
 const PROGRAM: f64 = 1e8;
-/// Bytes per parameter: value, optimiser state, gradient, and a copy of all of it while a checkpoint is written.
+/// Bytes per parameter: value, optimizer state, gradient, and a copy of all of it while a checkpoint is written.
 const PARAMETER: f64 = 40.0;
 /// Bytes per cell of an occupancy grid.
 const CELL: f64 = 12.0;

@@ -60,11 +60,11 @@ impl Scene {
         Ok(Opened::new(self, Some((capture, survey)), asked))
     }
 
-    /// Like [`open`](Self::open), with the scene transform of a model. `goes_on` is true for an unbounded scene.
-    pub fn open_for(&self, extent: &SceneBox, goes_on: bool) -> Result<Opened> {
+    /// Like [`open`](Self::open), with the scene transform of a model. `unbounded` is true for an unbounded scene.
+    pub fn open_for(&self, extent: &SceneBox, unbounded: bool) -> Result<Opened> {
         let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, None)) };
         let SceneBox { transform: placement, bounds, near_far: [near, far], ndc, .. } = *extent;
-        let scope = match (goes_on, ndc) {
+        let scope = match (unbounded, ndc) {
             (false, _) => SceneType::Bounded,
             (true, None) => SceneType::Unbounded,
             (true, Some(_)) => SceneType::ForwardFacing,
@@ -119,7 +119,11 @@ impl Opened {
                         embedded(split, EMBEDDED_SIZE / downscale)
                     }
                 };
-                Dataset { frames: evenly_spaced(data.frames, views), scope: self.asked.unwrap_or(data.scope), ..data }
+                Dataset {
+                    frames: evenly_spaced(data.frames, views),
+                    scene_type: self.asked.unwrap_or(data.scene_type),
+                    ..data
+                }
             }
             Some((capture, survey)) => {
                 let (progress, words) = (Progress::new(), format!("{split} images read"));

@@ -269,7 +269,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     scene.depth = config.loss_terms.iter().any(|term| term.kind() == "depth");
     let data = scene.load(Split::Train, downscale, usize::MAX)?;
     let [near, far] = extent.near_far;
-    let data = Dataset { bounds: extent.bounds, near, far, placement: extent.transform, ndc: extent.ndc, ..data };
+    let data = Dataset { bounds: extent.bounds, near, far, transform: extent.transform, ndc: extent.ndc, ..data };
     let names = data.frames.iter().map(|frame| &frame.name);
     if !names.eq(&run.config.photographs) {
         let what = format!(
@@ -279,7 +279,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
         return Err(Error::file(folder, what));
     }
     let (data, background) = (Arc::new(data), config.background.shown());
-    let mut trainer = Trainer::with_extent(config, data.clone(), extent)?;
+    let mut trainer = Trainer::with_scene_box(config, data.clone(), extent)?;
     let mut lock = run.lock()?;
     run.sweep();
     checkpoint::load(&run, &mut trainer)?;
@@ -347,7 +347,7 @@ fn train(
     summarise(&run, &trainer.stats(), ended == Ended::Interrupted)?;
     if let Some(reason) = &diverged {
         let schedule = trainer.model.config.schedule;
-        let rate = if let Schedule::Constant { .. } = schedule { "rate" } else { "from" };
+        let rate = if let Schedule::Constant { .. } = schedule { "lr" } else { "from" };
         complain(&format!(
             "training diverged: its values are not finite{reason}; the saved model is from step {}; lower the \
              learning rate with --set schedule.{}.{rate}=VALUE",

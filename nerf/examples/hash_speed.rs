@@ -1,5 +1,5 @@
 //! How fast the hash grid is on one thread: nanoseconds a sample for encoding, for adding gradients to a level's table
-//! and for the optimiser (also a row that it moves, with adding its gradient to none), at random positions and in order along
+//! and for the optimizer (also a row that it moves, with adding its gradient to none), at random positions and in order along
 //! rays.
 //!
 //! ```text
@@ -93,7 +93,7 @@ fn measure(config: &HashGridConfig, name: &str, position: fn(usize, usize) -> f6
             for (least, time) in least.iter_mut().zip(times) {
                 *least = least.min(time.as_secs_f64());
             }
-            moved += if run == 0 { report.moved / shape[1] } else { 0 };
+            moved += if run == 0 { report.updated / shape[1] } else { 0 };
         }
         scatter += least[0] * 1e9 / (TILE * TILES) as f64;
         adam += least[1] * 1e9;

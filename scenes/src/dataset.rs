@@ -69,7 +69,16 @@ pub fn landscape_ahead(split: Split, width: usize) -> Dataset {
 }
 
 fn dataset(frames: Vec<Frame>, bounds: [DVec3; 2], [near, far]: [f64; 2], scope: SceneType) -> Dataset {
-    Dataset { frames, bounds, near, far, scope, ndc: None, placement: SceneTransform::default(), skipped: vec![] }
+    Dataset {
+        frames,
+        bounds,
+        near,
+        far,
+        scene_type: scope,
+        ndc: None,
+        transform: SceneTransform::default(),
+        skipped: vec![],
+    }
 }
 
 /// Frames with the images of some cameras.
@@ -123,7 +132,7 @@ mod tests {
     #[test]
     fn window_sees_nothing_near() {
         let data = landscape_ahead(Split::Test, 16);
-        assert_eq!((data.frames.len(), data.scope), (6, SceneType::ForwardFacing));
+        assert_eq!((data.frames.len(), data.scene_type), (6, SceneType::ForwardFacing));
         for frame in &data.frames {
             let distances = landscape_distances(&frame.camera);
             assert!(distances.data.iter().all(|d| *d == 0.0 || f64::from(*d) > data.near));

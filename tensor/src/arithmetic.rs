@@ -284,7 +284,7 @@ impl<T: Scalar> Tensor<T> {
 
     /// Whether the shapes are equal and each element `x` is close to the element `y` of `other`:
     /// `|x - y| <= absolute + relative * |y|`, or `x == y`. NaN is close to no number.
-    pub fn is_close(&self, other: &Self, relative: f64, absolute: f64) -> bool {
+    pub fn allclose(&self, other: &Self, relative: f64, absolute: f64) -> bool {
         let close = |a: f64, b: f64| a == b || (b.is_finite() && (a - b).abs() <= absolute + relative * b.abs());
         self.shape() == other.shape() && self.iter().zip(other.iter()).all(|(a, b)| close(a.to_f64(), b.to_f64()))
     }
@@ -369,15 +369,15 @@ mod tests {
             (x.minimum(Tensor::from([0.5; 4])), |x| x.min(0.5)),
             (x.clamp(0.0, 2.0), |x| x.clamp(0.0, 2.0)),
         ] {
-            assert!(got.is_close(&x.iter().map(f).collect(), 1e-14, 0.0), "{got}");
+            assert!(got.allclose(&x.iter().map(f).collect(), 1e-14, 0.0), "{got}");
         }
         let nan = Tensor::from([f64::NAN]);
-        assert!(nan.clamp(0.0, 1.0)[[0]].is_nan() && nan.maximum(3.0)[[0]].is_nan() && !nan.is_close(&nan, 1.0, 1.0));
-        assert!(!x.is_close(&x.reshape(&[4, 1]), 1.0, 1.0));
+        assert!(nan.clamp(0.0, 1.0)[[0]].is_nan() && nan.maximum(3.0)[[0]].is_nan() && !nan.allclose(&nan, 1.0, 1.0));
+        assert!(!x.allclose(&x.reshape(&[4, 1]), 1.0, 1.0));
         let [one, near] = [1.0, 1.1].map(|x| Tensor::<f64>::from([2.0, x]));
-        assert!(one.is_close(&near, 0.1, 0.0) && !one.is_close(&near, 0.09, 0.0));
-        assert!(one.is_close(&near, 0.0, 0.11) && !one.is_close(&near, 0.0, 0.09));
-        assert!(!Tensor::from([1.0]).is_close(&Tensor::from([f64::INFINITY]), 1.0, 1.0));
+        assert!(one.allclose(&near, 0.1, 0.0) && !one.allclose(&near, 0.09, 0.0));
+        assert!(one.allclose(&near, 0.0, 0.11) && !one.allclose(&near, 0.0, 0.09));
+        assert!(!Tensor::from([1.0]).allclose(&Tensor::from([f64::INFINITY]), 1.0, 1.0));
     }
 
     #[test]

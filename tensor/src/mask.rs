@@ -66,7 +66,7 @@ impl Mask {
     /// # Panics
     /// If there are more than 2^32 elements.
     #[track_caller]
-    pub fn nonzero(&self) -> Indices {
+    pub fn flatnonzero(&self) -> Indices {
         let places: Vec<u32> = (0..self.values.len()).filter(|&i| self.values[i]).map(crate::indices::index).collect();
         Indices::new(&[places.len()], places)
     }
@@ -364,7 +364,7 @@ mod tests {
         is(x.gt(2.5) | &x.lt(1.5), [true, false, true, false]);
         assert!(x.gt(1.5) != [false, true, true, false] && row.gt(1.5) == [true, true]);
         assert!(x.is_nan().any() && !x.is_nan().all() && Mask::new(&[0], []).all() && !Mask::new(&[0], []).any());
-        assert_eq!((x.gt(1.5).count(), x.gt(1.5).nonzero().as_slice()), (2, &[1, 2][..]));
+        assert_eq!((x.gt(1.5).count(), x.gt(1.5).flatnonzero().as_slice()), (2, &[1, 2][..]));
         assert_eq!(x.gt(1.5).cast::<f32>(), Tensor::from([[0.0, 1.0], [1.0, 0.0]]));
         assert_eq!(row.where_(&x.is_nan(), &x), Tensor::from([[1.0, 2.0], [3.0, 2.0]]));
         assert_eq!(x.t().masked_select(&x.t().gt(0.0)), Tensor::from([1.0, 3.0, 2.0]));

@@ -206,7 +206,7 @@ impl<T: Scalar> Tensor<T> {
     /// # Panics
     /// If the shapes differ.
     #[track_caller]
-    pub fn distance(&self, other: &Self) -> T {
+    pub fn max_abs_diff(&self, other: &Self) -> T {
         assert_eq!(self.shape(), other.shape(), "the distance of tensors of different shapes");
         if self.is_empty() { T::ZERO } else { self.zip(other, |a, b| Real::abs(a - b)).max() }
     }
@@ -224,10 +224,10 @@ mod tests {
             let array = x.view();
             for axis in 0..3 {
                 for signed in [axis as isize, axis as isize - 3] {
-                    assert!(x.sum_over(signed).is_close(&array.sum_axis(Axis(axis)).into(), 1e-13, 1e-13));
-                    assert!(x.mean_over(signed).is_close(&array.mean_axis(Axis(axis)).unwrap().into(), 1e-13, 1e-13));
-                    assert!(x.var_over(signed, 0).is_close(&array.var_axis(Axis(axis), 0.0).into(), 1e-13, 0.0));
-                    assert!(x.std_over(signed, 1).is_close(&array.std_axis(Axis(axis), 1.0).into(), 1e-13, 0.0));
+                    assert!(x.sum_over(signed).allclose(&array.sum_axis(Axis(axis)).into(), 1e-13, 1e-13));
+                    assert!(x.mean_over(signed).allclose(&array.mean_axis(Axis(axis)).unwrap().into(), 1e-13, 1e-13));
+                    assert!(x.var_over(signed, 0).allclose(&array.var_axis(Axis(axis), 0.0).into(), 1e-13, 0.0));
+                    assert!(x.std_over(signed, 1).allclose(&array.std_axis(Axis(axis), 1.0).into(), 1e-13, 0.0));
                     let fold =
                         |start: f64, f: fn(f64, f64) -> f64| array.fold_axis(Axis(axis), start, |&a, &b| f(a, b));
                     assert_eq!(x.max_over(signed), Tensor::from(fold(f64::MIN, f64::max)));
@@ -251,9 +251,9 @@ mod tests {
             assert!((x.norm() - array.mapv(|x| x * x).sum().sqrt()).abs() < 1e-12);
             // Several axes are one.
             let middle = x.permute(&[1, 0, 2]).reshape(&[x.shape()[1], x.len() / x.shape()[1]]);
-            assert!(x.var_over([0, -1], 1).is_close(&middle.var_over(1, 1), 1e-13, 0.0));
+            assert!(x.var_over([0, -1], 1).allclose(&middle.var_over(1, 1), 1e-13, 0.0));
             assert_eq!(x.max_over(Axes::from([2, 0]).keepdims()).to_vec(), middle.max_over(1).to_vec());
-            assert!(x.sum_over([0, -1]).is_close(&middle.sum_over(1), 1e-13, 1e-13));
+            assert!(x.sum_over([0, -1]).allclose(&middle.sum_over(1), 1e-13, 1e-13));
         }
     }
 
@@ -266,10 +266,10 @@ mod tests {
         assert_eq!((none.sum(), none.norm(), none.sum_over(0).to_vec()), (0.0, 0.0, vec![0.0; 2]));
         assert!(none.mean().is_nan() && none.var_over(0, 0)[[1]].is_nan() && none.max_over(1).is_empty());
         assert!(std::panic::catch_unwind(|| none.max_over(0)).is_err());
-        assert_eq!((huge.distance(&huge), none.distance(&none)), (0.0, 0.0));
+        assert_eq!((huge.max_abs_diff(&huge), none.max_abs_diff(&none)), (0.0, 0.0));
         let (zero, far) = (Tensor::from([0.0, 0.0]), Tensor::from([1.0_f32, -3.0]));
-        assert_eq!((zero.distance(&far), far.distance(&zero)), (3.0, 3.0));
-        assert!(Tensor::from([f32::NAN, 0.0]).distance(&Tensor::from([0.0, 1.0])).is_nan());
+        assert_eq!((zero.max_abs_diff(&far), far.max_abs_diff(&zero)), (3.0, 3.0));
+        assert!(Tensor::from([f32::NAN, 0.0]).max_abs_diff(&Tensor::from([0.0, 1.0])).is_nan());
     }
 
     #[test]

@@ -65,7 +65,7 @@ fn comes_back(model: &Model<f32>) -> Vec<f32> {
 fn proposals_are_trained_rendered_and_stored() {
     let proposal = ProposalConfig { samples: 12, batch: 256, tile: 64, anneal: 20, ..ProposalConfig::default() };
     let mut config = Config { sampler: SamplerConfig::new(proposal), ..instant() };
-    config.schedule = Schedule::Constant { rate: 1e-2 };
+    config.schedule = Schedule::Constant { lr: 1e-2 };
     let mut trainer = Trainer::new(config, DATA.clone()).unwrap();
     let names: Vec<String> =
         trainer.model.params.names().filter(|name| name.contains("proposal")).map(String::from).collect();
@@ -285,7 +285,7 @@ fn normals_are_unit_vectors_down_the_density() {
     let (model, rays) = busy();
     let tape = Tape::new();
     let params = model.params.bind_constant(&tape);
-    let query = Query { slopes: true, ..Query::new(&*model.field, &params) };
+    let query = Query { position_grad: true, ..Query::new(&*model.field, &params) };
     let steps: Samples<f64> = stratified(&rays, 7, &mut Jitter::Middle, tape.pool());
     let seen = Quadrature::Midpoint.render(&query, &steps, 0.0).rendered;
     let normals = seen.normals();

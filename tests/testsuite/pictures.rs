@@ -130,7 +130,7 @@ fn mistaken(image: &Image) -> [Image; 3] {
 fn normals_apart(model: &Model<f32>, camera: &Camera, truth: &Image) -> f64 {
     let tape = Tape::new();
     let params = model.params.bind_constant(&tape);
-    let query = Query { slopes: true, ..Query::new(&*model.field, &params) };
+    let query = Query { position_grad: true, ..Query::new(&*model.field, &params) };
     let mut rays = Rays::new();
     for i in 0..camera.width * camera.height {
         rays.push_pixel(camera, [i % camera.width, i / camera.width], model.reach(), model.scene_box.near_far);
@@ -169,9 +169,9 @@ fn learned_scene_has_true_colour_depth_and_normals() {
         bounds: [low - 0.02, high + 0.02],
         near: 2.0,
         far: 6.0,
-        scope: SceneType::Bounded,
+        scene_type: SceneType::Bounded,
         ndc: None,
-        placement: SceneTransform::default(),
+        transform: SceneTransform::default(),
         skipped: vec![],
     };
     let mut config = Config::preset(Preset::Instant);

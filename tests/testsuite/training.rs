@@ -49,7 +49,7 @@ fn training_resumes_from_its_state_bit_for_bit() {
     let data = Arc::new(photographs(12, 20));
     let mut everything = instant();
     everything.field.get_mut::<InstantConfig>().unwrap().appearance_embedding_dim = 3;
-    everything.poses = Some(Schedule::Constant { rate: 1e-3 });
+    everything.poses = Some(Schedule::Constant { lr: 1e-3 });
     let smooth = TotalVariationConfig { weight: 0.1, params: "field.density.0.weight".into(), cells: None, draws: 2 };
     everything.loss_terms = vec![LossTermConfig::new(smooth)];
     let proposal = ProposalConfig { samples: 8, batch: 128, tile: 32, anneal: 30, ..ProposalConfig::default() };
@@ -234,8 +234,8 @@ fn pose_refinement_finds_known_offsets() {
     let error = Model::<f32>::new(trainer.model.config.clone(), SceneBox { frames: 0, ..trainer.model.scene_box }, 0);
     assert!(error.err().unwrap().to_string().starts_with("`poses`"));
     let mut bad = trainer.model.config.clone();
-    bad.poses = Some(Schedule::Constant { rate: -1.0 });
-    assert!(bad.check().unwrap_err().to_string().starts_with("`poses.constant.rate`"));
+    bad.poses = Some(Schedule::Constant { lr: -1.0 });
+    assert!(bad.check().unwrap_err().to_string().starts_with("`poses.constant.lr`"));
 }
 
 #[test]

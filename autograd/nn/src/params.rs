@@ -297,7 +297,7 @@ impl<T: Scalar> Params<T> {
         let free = parts.filter(|(_, (_, setting))| !setting.frozen);
         let moves = free.zip(grads).map(move |((slot, ((name, value), setting)), grad)| {
             let lazy = setting.moves_rows(value);
-            ParamUpdate { slot, name, value, grad, rate: rate(slot) * setting.rate, decay: setting.decay, lazy }
+            ParamUpdate { slot, name, value, grad, lr: rate(slot) * setting.rate, weight_decay: setting.decay, lazy }
         });
         moves.filter(|part| !part.grad.is_zero())
     }

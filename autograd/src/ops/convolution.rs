@@ -413,7 +413,7 @@ mod tests {
             let seen = x.slice(s![.., .., first..height.min(row + 3)]);
             let expected = seen.conv2d_bias(&w, &b, &config);
             let expected = expected.slice(s![.., .., row - first..row - first + 1]);
-            assert!(y.slice(s![.., .., row..row + 1]).value().is_close(expected.value(), 1e-12, 1e-12), "row {row}");
+            assert!(y.slice(s![.., .., row..row + 1]).value().allclose(expected.value(), 1e-12, 1e-12), "row {row}");
         }
         let difference = y - plain - b.reshape(&[o, 1, 1]);
         assert!(difference.abs().value().as_slice().iter().all(|x| *x <= 1e-12));

@@ -281,7 +281,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ.
     #[track_caller]
-    pub fn binary_cross_entropy(&self, target: impl Operand<'t, T>) -> Self {
+    pub fn binary_cross_entropy_with_logits(&self, target: impl Operand<'t, T>) -> Self {
         self.loss(BinaryCrossEntropy, target)
     }
 
@@ -290,8 +290,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ.
     #[track_caller]
-    pub fn binary_cross_entropy_loss(&self, target: impl Operand<'t, T>) -> Self {
-        self.binary_cross_entropy(target).mean()
+    pub fn binary_cross_entropy_with_logits_loss(&self, target: impl Operand<'t, T>) -> Self {
+        self.binary_cross_entropy_with_logits(target).mean()
     }
 
     /// The cross-entropy of each row of logits, `-ln softmax(row)[class]`: `[.., n]` to `[..]`. `classes` has one class

@@ -160,7 +160,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     pub fn masked_select(&self, mask: &Mask) -> Self {
         let same = ensure(mask.shape() == self.shape(), || format!("the mask has the shape {:?}", mask.shape()));
         self.fits("masked_select", same);
-        self.reshape(&[self.value().len()]).gather_rows(mask.nonzero())
+        self.reshape(&[self.value().len()]).gather_rows(mask.flatnonzero())
     }
 
     /// Linear interpolation, `self + weight * (end - self)`, exact at weights 0 and 1. Shapes broadcast.

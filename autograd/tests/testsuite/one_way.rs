@@ -196,7 +196,7 @@ fn classes_come_in_a_list_or_in_the_shape_of_the_rows() {
     let list = x.cross_entropy([0, 1, 2, 3, 0, 1]);
     assert_eq!(list.value(), x.cross_entropy(Indices::new(&[2, 3], [0, 1, 2, 3, 0, 1])).value());
     let expected = -x.log_softmax(-1).gather(-1, Indices::new(&[2, 3, 1], [0, 1, 2, 3, 0, 1])).squeeze(-1);
-    assert!(list.value().is_close(expected.value(), 1e-14, 0.0));
+    assert!(list.value().allclose(expected.value(), 1e-14, 0.0));
     let sorted = tape.leaf(Tensor::from([1.0, 2.0, 2.0, 3.0]));
     let found = [false, true].map(|right| sorted.searchsorted(2.0, right).as_slice()[0]);
     assert_eq!(found, [1, 3]);

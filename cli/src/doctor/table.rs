@@ -29,7 +29,9 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     if facts.points > 0 {
         rows.push(("points", facts.points.to_string()));
     }
-    if let Some(SceneLayout { scope, reason, near, far, bounds: [low, high], scale, up, middle }) = &facts.layout {
+    if let Some(SceneLayout { scene_type: scope, reason, near, far, bounds: [low, high], scale, up, middle }) =
+        &facts.layout
+    {
         rows.push(("scene type", format!("{scope}: {reason}")));
         rows.push(("near to far", format!("{near:.3} to {far:.3} scene units")));
         rows.push(("scene box", format!("{low:.2} to {high:.2} scene units")));

@@ -143,7 +143,7 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Pa
     };
     drop(display);
     job.check(out)?;
-    let bytes = files::write_with_comment(&shape.placed_back(&model.scene_box.transform), out, job.mark())?;
+    let bytes = files::write_with_comment(&shape.into_capture(&model.scene_box.transform), out, job.mark())?;
     let part = if model.config.unbounded { ", cropped to the scene box" } else { "" };
     let (size, seconds) = (bytes as f64 / 1e6, start.elapsed().as_secs_f64());
     print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))

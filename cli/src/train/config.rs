@@ -28,7 +28,7 @@ impl Args {
         if let Some(skip) = self.skip {
             config = config.with_skip(skip);
         }
-        config = config.with_scene_type(data.scope);
+        config = config.with_scene_type(data.scene_type);
         if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
             let what = format!(
                 "{} spaces samples evenly, too few for the long rays of an unbounded scene: use instant or voxel, or \
@@ -88,11 +88,11 @@ impl Args {
 /// # Errors
 /// If the near plane is negative or not in front of the far plane.
 pub fn set_near(data: &mut Dataset, near: f64) -> Result<()> {
-    let far = data.far / data.placement.scale;
+    let far = data.far / data.transform.scale;
     if !(0.0..far).contains(&near) {
         return Err(Error::setting("near", format!("is {near}; use 0 to less than {far:.4}, the far plane")));
     }
-    let near = near * data.placement.scale;
+    let near = near * data.transform.scale;
     data.ndc = data.ndc.map(|ndc| ndc.with_near(data.near, near));
     data.near = near;
     Ok(())

@@ -238,7 +238,7 @@ mod tests {
     }
 
     fn model(bounds: [DVec3; 2], cameras: &[Camera], learns: bool) -> Model<f32> {
-        let poses = learns.then_some(Schedule::Constant { rate: 1e-3 });
+        let poses = learns.then_some(Schedule::Constant { lr: 1e-3 });
         let extent = SceneBox { frames: cameras.len(), ..SceneBox::new(bounds, [0.1, 9.0]) };
         Model::with_cameras(Config { poses, ..Config::preset(Preset::Voxel) }, extent, cameras, 0).unwrap()
     }

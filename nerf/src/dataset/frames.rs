@@ -88,12 +88,12 @@ pub struct Dataset {
     /// Far plane: distance along a ray, in scene units.
     pub far: f64,
     /// Bounded, unbounded or forward-facing.
-    pub scope: SceneType,
+    pub scene_type: SceneType,
     /// The NDC frustum of all images of the capture, other splits included, if it is
     /// [forward-facing](SceneType::ForwardFacing).
     pub ndc: Option<Ndc>,
     /// The transform from the files' coordinates to those of the scene, which all fields use.
-    pub placement: SceneTransform,
+    pub transform: SceneTransform,
     /// Names of listed images whose files do not exist. They were left out; callers should report them.
     pub skipped: Vec<String>,
 }
@@ -108,7 +108,7 @@ impl Dataset {
         let [lower, upper] = self.bounds;
         let (middle, side) = (0.5 * (lower + upper), (upper - lower).max_element());
         let each = self.frames.iter().map(|Frame { camera, .. }| {
-            if let Some(ndc) = self.ndc.filter(|_| self.scope == SceneType::ForwardFacing) {
+            if let Some(ndc) = self.ndc.filter(|_| self.scene_type == SceneType::ForwardFacing) {
                 return ndc.pixels(camera, middle);
             }
             let distance = camera.pose.translation.distance(middle).max(0.5 * side);

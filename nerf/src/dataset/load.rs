@@ -224,8 +224,8 @@ impl Capture {
             near: survey.near,
             ndc: survey.ndc,
             far: survey.far,
-            scope: survey.scene_type,
-            placement: survey.transform,
+            scene_type: survey.scene_type,
+            transform: survey.transform,
             skipped: absent.into_iter().map(|view| view.name.clone()).collect(),
         })
     }

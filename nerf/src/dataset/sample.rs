@@ -30,9 +30,9 @@ pub(crate) fn ball(split: Split, size: usize) -> Dataset {
         bounds: [DVec3::splat(-1.3), DVec3::splat(1.3)],
         near: DISTANCE - 2.3,
         far: DISTANCE + 2.3,
-        scope: SceneType::Bounded,
+        scene_type: SceneType::Bounded,
         ndc: None,
-        placement: SceneTransform::default(),
+        transform: SceneTransform::default(),
         skipped: vec![],
     }
 }
@@ -48,7 +48,7 @@ pub(crate) fn ball_ahead(size: usize) -> Dataset {
     let (near, far) = (0.5, 1e4);
     let ndc = Ndc::around(&cameras, near).ok();
     let frames = frames(cameras.into_iter());
-    Dataset { frames, near, far, scope: SceneType::ForwardFacing, ndc, ..ball(Split::Val, 1) }
+    Dataset { frames, near, far, scene_type: SceneType::ForwardFacing, ndc, ..ball(Split::Val, 1) }
 }
 
 /// Renders the ball for each camera.

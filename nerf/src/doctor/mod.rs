@@ -99,7 +99,7 @@ fn without_pixels(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &
         lenses,
         points: capture.points.len(),
         layout: survey.map(|survey| SceneLayout {
-            scope: survey.scene_type,
+            scene_type: survey.scene_type,
             reason: survey.reason.clone(),
             near: survey.near,
             far: survey.far,

@@ -60,7 +60,7 @@ pub struct CaptureSubset {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneLayout {
     /// Bounded, unbounded or forward-facing.
-    pub scope: SceneType,
+    pub scene_type: SceneType,
     /// The reason for this type.
     pub reason: String,
     /// Near plane, in scene units.

@@ -24,7 +24,7 @@ impl From<Mesh> for ColoredMesh {
 
 impl ColoredMesh {
     /// Maps scene coordinates to those of the capture.
-    pub fn placed_back(mut self, placement: &SceneTransform) -> Self {
+    pub fn into_capture(mut self, placement: &SceneTransform) -> Self {
         self.mesh.positions.iter_mut().for_each(|place| *place = placement.point_back(*place));
         let back = placement.rotation.transpose();
         self.normals.iter_mut().for_each(|normal| *normal = back * *normal);

@@ -87,7 +87,7 @@ impl<'t, T: Scalar> LossInputs<'_, 't, T> {
         samples: usize,
         evaluate: impl FnOnce(LossInputs<'_, 't, T>) -> R,
     ) -> R {
-        let query = Query { slopes: true, ..Query::new(field, params) };
+        let query = Query { position_grad: true, ..Query::new(field, params) };
         let samples = stratified(rays, samples, &mut Jitter::Middle, &Pool::new());
         let black = &Tensor::zeros(&[rays.len(), 3]);
         evaluate(LossInputs {

@@ -82,18 +82,18 @@ impl ComponentConfig<LossTerms> for DistortionConfig {
 
     fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn LossTerm<T>>> {
         let reach = site.space.unbounded.then_some(0.5 * site.space.side());
-        Ok(Arc::new(Evenness { weight: self.weight, reach }))
+        Ok(Arc::new(DistortionLoss { weight: self.weight, reach }))
     }
 }
 
 /// The distortion loss with its scale of distances.
-struct Evenness {
+struct DistortionLoss {
     weight: f64,
     /// Half of the side of an unbounded scene's box: beyond it distances are inverted.
     reach: Option<f64>,
 }
 
-impl Evenness {
+impl DistortionLoss {
     /// Maps a distance to a share of the span, monotonically.
     fn place(&self, distance: f64, [near, far]: [f64; 2]) -> f64 {
         match self.reach {
@@ -123,7 +123,7 @@ struct Depth {
     unit: f64,
 }
 
-impl<T: Scalar> LossTerm<T> for Evenness {
+impl<T: Scalar> LossTerm<T> for DistortionLoss {
     fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
         let samples = &seen.rendered.samples;
         let (mut middles, mut lengths) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
@@ -249,7 +249,7 @@ mod tests {
     #[test]
     fn loss_terms_match_formulas_and_differences() {
         let terms: [&dyn LossTerm<f64>; 4] = [
-            &Evenness { weight: 2.0, reach: None },
+            &DistortionLoss { weight: 2.0, reach: None },
             &EntropyConfig { weight: 0.5 },
             &OrientationConfig { weight: 3.0 },
             &Depth { weight: 4.0, unit: 1.6 },
@@ -261,11 +261,13 @@ mod tests {
         }
         // Thin fog is spread over the span; thick fog absorbs at its start.
         assert!(at(terms[0], 0.0, 0.0) > 2.0 * at(terms[0], 6.0, 0.0));
-        assert!((at(terms[0], 0.5, 0.2) - 2.0 * at(&Evenness { weight: 1.0, reach: None }, 0.5, 0.2)).abs() < 1e-12);
+        assert!(
+            (at(terms[0], 0.5, 0.2) - 2.0 * at(&DistortionLoss { weight: 1.0, reach: None }, 0.5, 0.2)).abs() < 1e-12
+        );
         // A wall in the first of five bins has its own length alone: a third of a fifth of the span, for both rays.
         assert!((at(terms[0], 9.0, 0.0) - 2.0 * 2.0 / 15.0).abs() < 1e-6, "{}", at(terms[0], 9.0, 0.0));
         // An unbounded scene with half a box of 1.1: linear up to there, then inverse, with the limit 1.
-        let unbounded = Evenness { weight: 2.0, reach: Some(1.1) };
+        let unbounded = DistortionLoss { weight: 2.0, reach: Some(1.1) };
         let places = [0.0, 0.55, 1.1, 2.2, 1e9].map(|distance| unbounded.place(distance, [0.5, 2.0]));
         assert!(places.iter().zip([0.0, 0.25, 0.5, 0.75, 1.0]).all(|(a, b)| (a - b).abs() < 1e-9), "{places:?}");
         // The walls' bins have the lengths 0.3 and 0.25, over 2.2.
@@ -305,12 +307,12 @@ mod tests {
             let (space, params) = (Space { unbounded, ..space }, &mut Params::<f64>::new());
             let rng = &mut Pcg64Mcg::seed_from_u64(0);
             let built = config.build(BuildContext { space, frames: 0, params, name: "terms", rng }).unwrap();
-            let by_hand = Evenness { weight: 2.0, reach };
+            let by_hand = DistortionLoss { weight: 2.0, reach };
             assert_eq!(at(&*built, 0.3, 0.4), at(&by_hand, 0.3, 0.4));
         }
         assert_ne!(
-            at(&Evenness { weight: 2.0, reach: None }, 0.3, 0.4),
-            at(&Evenness { weight: 2.0, reach: Some(1.1) }, 0.3, 0.4)
+            at(&DistortionLoss { weight: 2.0, reach: None }, 0.3, 0.4),
+            at(&DistortionLoss { weight: 2.0, reach: Some(1.1) }, 0.3, 0.4)
         );
     }
 

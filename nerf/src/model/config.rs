@@ -243,17 +243,17 @@ impl Config {
 
     /// Adapts the hash grid and the sampling to a training budget.
     ///
-    /// `samples` is [`Budget::samples`](crate::Budget::samples), `footprints` is
+    /// `samples` is [`Budget::samples`](crate::Budget::samples), `pixels_per_side` is
     /// [`Dataset::pixels_per_side`](crate::dataset::Dataset::pixels_per_side). [`HashGridConfig::cpu`] chooses the
     /// table's size and resolution. Beyond 200 million samples (100 seconds on two cores) steps along a ray shrink
     /// during training, down to a pixel's footprint. Beyond 600 million a training step has twice as many samples.
-    pub fn for_budget(mut self, samples: f64, footprints: f64) -> Self {
+    pub fn for_budget(mut self, samples: f64, pixels_per_side: f64) -> Self {
         if let Some(field) = self.field.get_mut::<InstantConfig>() {
-            field.grid = HashGridConfig::cpu(samples, footprints);
+            field.grid = HashGridConfig::cpu(samples, pixels_per_side);
             if let Some(marching) = self.sampler.get_mut::<MarchingConfig>()
                 && samples > 2e8
             {
-                (marching.step, marching.last_step) = (1.0 / 150.0, Some(1.0 / footprints.clamp(150.0, 450.0)));
+                (marching.step, marching.last_step) = (1.0 / 150.0, Some(1.0 / pixels_per_side.clamp(150.0, 450.0)));
                 marching.samples *= if samples > 6e8 { 2 } else { 1 };
             }
         }
@@ -446,16 +446,16 @@ mod tests {
                 .contains("poses, focal, lens, exposure or vignetting")
         );
         let mut wrong = refined(RefinedParam::Vignetting);
-        wrong.exposure_model.vignetting = Some(Schedule::Constant { rate: f64::NAN });
-        assert!(wrong.check().unwrap_err().to_string().starts_with("`exposure_model.vignetting.constant.rate`"));
+        wrong.exposure_model.vignetting = Some(Schedule::Constant { lr: f64::NAN });
+        assert!(wrong.check().unwrap_err().to_string().starts_with("`exposure_model.vignetting.constant.lr`"));
         wrong.exposure_model = ExposureConfig { exposure: wrong.exposure_model.vignetting, vignetting: None };
-        assert!(wrong.check().unwrap_err().to_string().starts_with("`exposure_model.exposure.constant.rate`"));
+        assert!(wrong.check().unwrap_err().to_string().starts_with("`exposure_model.exposure.constant.lr`"));
     }
 
     #[test]
     fn model_size_follows_budget_and_images() {
-        let made = |samples: f64, footprints: f64| {
-            let config = Config::preset(Preset::Instant).for_budget(samples, footprints);
+        let made = |samples: f64, pixels_per_side: f64| {
+            let config = Config::preset(Preset::Instant).for_budget(samples, pixels_per_side);
             config.check().unwrap();
             let grid = &config.field.get::<InstantConfig>().unwrap().grid;
             let marching = config.sampler.get::<MarchingConfig>().unwrap();

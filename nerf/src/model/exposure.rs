@@ -132,7 +132,7 @@ mod tests {
     use raygrad_autograd::Tape;
     use raygrad_autograd::check::{Check, check_function};
 
-    const RATE: Option<Schedule> = Some(Schedule::Constant { rate: 0.1 });
+    const RATE: Option<Schedule> = Some(Schedule::Constant { lr: 0.1 });
 
     /// A trained exposure model of two images.
     fn learned() -> (ExposureModel, Params<f64>) {

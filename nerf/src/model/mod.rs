@@ -57,7 +57,7 @@ pub struct Model<T: Scalar> {
     /// The sampler, which places samples along rays.
     pub sampler: Box<dyn Sampler<T>>,
     /// Loss terms that are added to the photometric loss.
-    pub terms: Vec<Arc<dyn LossTerm<T>>>,
+    pub loss_terms: Vec<Arc<dyn LossTerm<T>>>,
     /// Corrections of the training cameras, if any are learned.
     pub camera_optimizer: Option<CameraOptimizer>,
     /// The exposure model, if it is learned.
@@ -119,7 +119,7 @@ impl<T: Scalar> Model<T> {
             params,
             field,
             sampler,
-            terms,
+            loss_terms: terms,
             camera_optimizer: refine,
             exposure: tone,
             appearance_image: look,

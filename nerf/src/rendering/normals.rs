@@ -53,7 +53,7 @@ impl<T: Scalar> Model<T> {
                 return sampled.evaluations;
             }
             let termination = viewing.tolerance.unwrap_or_else(|| self.sampler.tolerance()).early_stop_eps.into();
-            let query = Query { slopes: true, ..*query };
+            let query = Query { position_grad: true, ..*query };
             let seen = self.sampler.quadrature().render(&query, &sampled.samples, termination);
             let normals = seen.rendered.accumulated_normals();
             out.iter_mut().zip(normals.as_slice()).for_each(|(out, value)| *out = value.to_f64() as f32);

@@ -253,8 +253,8 @@ mod tests {
         use std::sync::atomic::{AtomicUsize, Ordering};
         let (model, camera) = (model(), camera(64, 64));
         let asked = AtomicUsize::new(0);
-        let goes_on = || asked.fetch_add(1, Ordering::Relaxed) < 3;
-        let viewing = RenderOptions { keep_going: &goes_on, ..RenderOptions::over([1.0; 3]) };
+        let keep_going = || asked.fetch_add(1, Ordering::Relaxed) < 3;
+        let viewing = RenderOptions { keep_going: &keep_going, ..RenderOptions::over([1.0; 3]) };
         assert!(model.render_cancellable(&camera, &viewing).is_none());
         let tiles = (64 * 64_usize).div_ceil(model.sampler.view_tile());
         assert!((4..tiles).contains(&asked.load(Ordering::Relaxed)), "{asked:?} of {tiles}");

@@ -47,8 +47,8 @@ impl<T: Scalar> Model<T> {
         let span = [near, if bounds[0].cmplt(bounds[1]).all() { far } else { near }];
         let (pools, seen) = (Scratch::<Pool<T>>::default(), Mutex::new(Some(Evaluations::default())));
         parallel::each_of(out, |which, out| {
-            let goes_on = locked(&seen).is_some() && (viewing.keep_going)();
-            let evaluations = goes_on.then(|| {
+            let continues = locked(&seen).is_some() && (viewing.keep_going)();
+            let evaluations = continues.then(|| {
                 let mut rays = Rays::new();
                 for pixel in which * tile..count.min((which + 1) * tile) {
                     rays.push_pixel(camera, camera.place_of(pixel), bounds, span);

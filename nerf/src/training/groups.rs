@@ -111,11 +111,11 @@ mod tests {
     #[test]
     fn parameter_groups_have_own_lr_and_weight_decay() {
         let mut config = Config::preset(Preset::Instant);
-        config.schedule = Schedule::Constant { rate: 0.1 };
+        config.schedule = Schedule::Constant { lr: 0.1 };
         let group = |params: &str, rate, decay| GroupConfig {
             params: params.into(),
             adam: AdamConfig::default(),
-            schedule: Schedule::Constant { rate },
+            schedule: Schedule::Constant { lr: rate },
             weight_decay: decay,
         };
         config.groups = vec![group("pose", 0.001, 0.0), group("field.color", 0.2, 0.5)];
@@ -128,20 +128,20 @@ mod tests {
         let mut groups = Groups::new(&config, &params).unwrap();
         let grads: Vec<_> = (0..3).map(|_| Gradient::from(Tensor::full(&[2, 2], 3.0))).collect();
         let report = groups.update(&mut params, &grads, 0.0, 1.0);
-        assert_eq!((report.moved, report.skipped, groups.steps()), (12, 0, 1));
+        assert_eq!((report.updated, report.skipped, groups.steps()), (12, 0, 1));
         let moved: Vec<f32> = params.values().iter().map(|value| value.as_slice()[0]).collect();
         // Adam's first step is the learning rate; weight decay comes first.
         for (found, expected) in moved.iter().zip([0.9, 1.0 * (1.0 - 0.2 * 0.5) - 0.2, 0.999, 1.0]) {
             assert!((found - expected).abs() < 1e-6, "{moved:?}");
         }
         // Poses have their own schedule if they are learned.
-        for (poses, expected) in [(Some(Schedule::Constant { rate: 0.25 }), 0.75), (None, 0.9)] {
+        for (poses, expected) in [(Some(Schedule::Constant { lr: 0.25 }), 0.75), (None, 0.9)] {
             let mut learned = Params::new();
             learned.add("poses", Tensor::full(&[1, 6], 1.0_f32));
             let config = Config { poses, groups: vec![], ..config.clone() };
             let grads = [Gradient::from(Tensor::full(&[1, 6], 3.0))];
             let report = Groups::new(&config, &learned).unwrap().update(&mut learned, &grads, 0.0, 1.0);
-            assert_eq!(report.moved, 6);
+            assert_eq!(report.updated, 6);
             assert!((learned.values()[0].as_slice()[0] - expected).abs() < 1e-6, "{:?}", learned.values());
         }
         // The first matching group counts; one that matches nothing is an error.
@@ -154,7 +154,7 @@ mod tests {
     fn tables_and_networks_have_own_adam_constants() {
         // With a beta1 of 0 the second step forgets the first gradient; with 0.9 it does not.
         let mut config = Config::preset(Preset::Instant);
-        config.schedule = Schedule::Constant { rate: 0.1 };
+        config.schedule = Schedule::Constant { lr: 0.1 };
         config.table_adam = AdamConfig { beta1: 0.0, ..AdamConfig::default() };
         config.adam = AdamConfig { beta1: 0.9, ..AdamConfig::default() };
         let mut params = Params::new();
@@ -164,7 +164,7 @@ mod tests {
         let mut groups = Groups::new(&config, &params).unwrap();
         for g in [1.0, -1.0] {
             let grads: Vec<_> = (0..2).map(|_| Gradient::from(Tensor::full(&[1, 1], g))).collect();
-            assert_eq!(groups.update(&mut params, &grads, 0.0, 1.0).moved, 2);
+            assert_eq!(groups.update(&mut params, &grads, 0.0, 1.0).updated, 2);
         }
         let [table, weight] = [0, 1].map(|i| params.values()[i].item());
         assert!(table.abs() < 1e-6 && weight < -0.05, "{table} {weight}");

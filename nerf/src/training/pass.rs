@@ -51,7 +51,7 @@ pub(crate) fn rays_loss<'t>(
     jitter: &mut Jitter<'_>,
 ) -> (Var<'t, f32>, Work) {
     let (tape, sampler) = (params.tape(), &*model.sampler);
-    let slopes = model.terms.iter().any(|term| term.needs_normals());
+    let slopes = model.loss_terms.iter().any(|term| term.needs_normals());
     let seen = (&batch.frames[..], &batch.pixels[..]);
     let moved = model
         .camera_optimizer
@@ -59,7 +59,13 @@ pub(crate) fn rays_loss<'t>(
         .map(|refine| refine.rays(params, &batch.rays, seen, model.reach(), model.scene_box.near_far));
     let (vars, rays) = moved.as_ref().map_or((None, &batch.rays), |(vars, rays)| (Some(vars), rays));
     let near = model.config.gradient_scaling_distance * model.scene_box.unit;
-    let query = Query { frames: Some(&batch.frames), rays: vars, slopes, near, ..Query::new(&*model.field, params) };
+    let query = Query {
+        frames: Some(&batch.frames),
+        rays: vars,
+        position_grad: slopes,
+        gradient_scaling_distance: near,
+        ..Query::new(&*model.field, params)
+    };
     let rows = |values: &[[f32; 3]]| tape.pool().copy_of(&[values.len(), 3], values.as_flattened());
     let (target, background) = (rows(&batch.target), rows(&batch.background));
     let Sampled { samples: steps, coarse, histograms: levels, evaluations } =
@@ -84,7 +90,7 @@ pub(crate) fn rays_loss<'t>(
     let levels = levels.iter().map(|level| interlevel(level, &rendered.samples, weights));
     let (frames, pixels, distances) = (&batch.frames[..], &batch.pixels[..], &batch.distances[..]);
     let (rendered, target, background) = (&rendered, &target, &background);
-    let seed = if model.terms.is_empty() { 0 } else { jitter.seed() };
+    let seed = if model.loss_terms.is_empty() { 0 } else { jitter.seed() };
     let seen = LossInputs {
         params,
         rays,
@@ -97,7 +103,8 @@ pub(crate) fn rays_loss<'t>(
         target,
         background,
     };
-    let terms = (0..).zip(&model.terms).map(|(i, term)| term.loss(&LossInputs { seed: mixed(seed, [i, 0]), ..seen }));
+    let terms =
+        (0..).zip(&model.loss_terms).map(|(i, term)| term.loss(&LossInputs { seed: mixed(seed, [i, 0]), ..seen }));
     let loss = coarse.chain(levels).chain(terms).fold(fine, |sum, term| term + sum);
     let left: f64 = tape.no_grad(|| rendered.transmittance().value().as_slice().iter().map(|x| x.to_f64()).sum());
     let work = Work {

@@ -83,17 +83,17 @@ impl Trainer {
     /// If the configuration is out of range or does not fit the [type of scene](Dataset::scope). If the dataset has no
     /// frame, or none of its rays [meets the scene box](Dataset::check_reach).
     pub fn new(config: Config, data: Arc<Dataset>) -> Result<Self> {
-        if data.scope.is_unbounded() && !config.unbounded {
+        if data.scene_type.is_unbounded() && !config.unbounded {
             let what = "is false, but the dataset is unbounded; use `Config::with_scene_type` with the dataset's type";
             return Err(Error::setting("unbounded", what));
         }
-        let ndc = data.ndc.filter(|_| data.scope == SceneType::ForwardFacing);
-        if data.scope == SceneType::ForwardFacing && ndc.is_none() {
+        let ndc = data.ndc.filter(|_| data.scene_type == SceneType::ForwardFacing);
+        if data.scene_type == SceneType::ForwardFacing && ndc.is_none() {
             let what = "forward-facing needs `Dataset::ndc`, which `Ndc::around` finds; otherwise use unbounded";
             return Err(Error::setting("scene-type", what));
         }
-        let extent = SceneBox { transform: data.placement, ndc, ..SceneBox::new(data.bounds, [data.near, data.far]) };
-        Trainer::with_extent(config, data, extent)
+        let extent = SceneBox { transform: data.transform, ndc, ..SceneBox::new(data.bounds, [data.near, data.far]) };
+        Trainer::with_scene_box(config, data, extent)
     }
 
     /// Creates a trainer as [`new`](Self::new), with this scene box instead of the dataset's: for instance to
@@ -101,7 +101,7 @@ impl Trainer {
     ///
     /// # Errors
     /// As [`new`](Self::new).
-    pub fn with_extent(config: Config, data: Arc<Dataset>, extent: SceneBox) -> Result<Self> {
+    pub fn with_scene_box(config: Config, data: Arc<Dataset>, extent: SceneBox) -> Result<Self> {
         let start = Instant::now();
         Trainer::with_clock(config, data, extent, move || start.elapsed())
     }
@@ -124,7 +124,7 @@ impl Trainer {
         let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
         let (model, restarts) = startup::living_model(&config, extent, &cameras, config.seed)?;
         data.check_reach(model.reach())?;
-        data.check_distances(model.terms.iter().any(|term| term.needs_distances()))?;
+        data.check_distances(model.loss_terms.iter().any(|term| term.needs_distances()))?;
         let mut trainer = Trainer {
             groups: Groups::new(&model.config, &model.params)?,
             tiles: Tiles::new(),
@@ -223,7 +223,7 @@ impl Trainer {
             density_queries: self.done.density_queries + work.evaluations.density,
             color_queries: self.done.color_queries + work.evaluations.color,
             unskipped: self.done.unskipped + work.evaluations.unskipped,
-            moved: self.done.moved + report.moved as u64,
+            moved: self.done.moved + report.updated as u64,
             loss: work.loss / values,
             psnr: psnr_from_mse(work.error / values),
             opacity: work.opacity / self.batch as f64,

@@ -5,7 +5,7 @@ use super::query::{Query, RayVars};
 use super::render::Rendered;
 use super::rounds::FrontToBack;
 use crate::camera::rays::Samples;
-use raygrad_autograd::{Memo, Pool, Scalar};
+use raygrad_autograd::{CachedOutputs, Pool, Scalar};
 
 /// The result of rendering the visible samples only.
 pub struct VisibleSamples<'t, T: Scalar> {
@@ -52,7 +52,7 @@ impl Quadrature {
             };
         }
         // The unrecorded pass needs no variables.
-        let plain = &Query { rays: None, slopes: false, ..*query };
+        let plain = &Query { rays: None, position_grad: false, ..*query };
         let Visible { samples, memo, asked } = tape.no_grad(|| match self.has_intervals() {
             false => visible(plain, &nodes, termination),
             true => {
@@ -67,7 +67,7 @@ impl Quadrature {
         let same = |rays: &RayVars<'t, T>| {
             rays.origins.value() == &samples.origins && rays.directions.value() == &samples.directions
         };
-        let memo = if query.rays.is_none_or(same) { memo } else { Memo::gather(&[], &[], tape.pool()) };
+        let memo = if query.rays.is_none_or(same) { memo } else { CachedOutputs::gather(&[], &[], tape.pool()) };
         let density = tape.reuse_outputs(memo, || query.density_at(&samples, &positions));
         VisibleSamples {
             visible: samples.len(),
@@ -81,7 +81,7 @@ impl Quadrature {
 struct Visible<T: Scalar> {
     samples: Samples<T>,
     /// Cached outputs of operations for them.
-    memo: Memo<T>,
+    memo: CachedOutputs<T>,
     /// Density queries.
     asked: usize,
 }
@@ -108,10 +108,17 @@ fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, terminatio
 }
 
 /// Gathers rows of the memos of `sizes` samples; an empty memo if an output has other rows than samples.
-fn gathered<T: Scalar>(memos: Vec<Memo<T>>, rows: &[[u32; 2]], sizes: &[usize], pool: &Pool<T>) -> Memo<T> {
-    let fits = |(memo, size): (&Memo<T>, &usize)| memo.values().iter().all(|value| value.shape().first() == Some(size));
+fn gathered<T: Scalar>(
+    memos: Vec<CachedOutputs<T>>,
+    rows: &[[u32; 2]],
+    sizes: &[usize],
+    pool: &Pool<T>,
+) -> CachedOutputs<T> {
+    let fits = |(memo, size): (&CachedOutputs<T>, &usize)| {
+        memo.values().iter().all(|value| value.shape().first() == Some(size))
+    };
     match memos.iter().zip(sizes).all(fits) {
-        true => Memo::gather(&memos, rows, pool),
-        false => Memo::gather(&[], &[], pool),
+        true => CachedOutputs::gather(&memos, rows, pool),
+        false => CachedOutputs::gather(&[], &[], pool),
     }
 }

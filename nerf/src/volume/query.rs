@@ -26,16 +26,16 @@ pub struct Query<'a, 't, T: Scalar> {
     /// The rays as variables; `None` makes them constants.
     pub rays: Option<&'a RayVars<'t, T>>,
     /// Whether positions are variables even if rays are constants, as normals need.
-    pub slopes: bool,
+    pub position_grad: bool,
     /// The gradient scaling distance, in scene units; 0 turns it off. See
     /// [`Config::gradient_scaling_distance`](crate::Config::gradient_scaling_distance).
-    pub near: f64,
+    pub gradient_scaling_distance: f64,
 }
 
 impl<'a, 't, T: Scalar> Query<'a, 't, T> {
     /// Creates a query with constant rays and the mean appearance.
     pub fn new(field: &'a dyn Field<T>, params: &'a Bound<'t, T>) -> Self {
-        Query { field, params, frames: None, rays: None, slopes: false, near: 0.0 }
+        Query { field, params, frames: None, rays: None, position_grad: false, gradient_scaling_distance: 0.0 }
     }
 
     /// Returns the query for another field.
@@ -57,7 +57,7 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
                 let t = tape.constant(samples.t.reshape(&[samples.len(), 1]));
                 origins.segment_expand(&samples.segments) + directions.segment_expand(&samples.segments) * t
             }
-            None if self.slopes => tape.leaf(samples.positions(tape.pool())),
+            None if self.position_grad => tape.leaf(samples.positions(tape.pool())),
             None => tape.constant(samples.positions(tape.pool())),
         }
     }
@@ -80,15 +80,15 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
     #[track_caller]
     pub fn density_at(&self, samples: &Samples<T>, positions: &Var<'t, T>) -> Density<'t, T> {
         let density = self.field.density(self.params, positions);
-        match self.less(samples) {
-            Some(shares) => Density { value: with_slopes(density.value, &shares), ..density },
+        match self.gradient_scale(samples) {
+            Some(shares) => Density { value: scale_gradient(density.value, &shares), ..density },
             None => density,
         }
     }
 
     /// The gradient scale of each sample, `[samples]`, if any is below 1.
-    fn less(&self, samples: &Samples<T>) -> Option<Tensor<T>> {
-        let near = self.near;
+    fn gradient_scale(&self, samples: &Samples<T>) -> Option<Tensor<T>> {
+        let near = self.gradient_scaling_distance;
         if near == 0.0 || !self.tape().is_recording() || !samples.t.as_slice().iter().any(|t| t.to_f64() < near) {
             return None;
         }
@@ -101,15 +101,15 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
         let directions = &self.directions(samples);
         let seen = ViewInputs { directions, segments: &samples.segments, frames: self.frames };
         let color = self.field.color(self.params, features, &seen);
-        match self.less(samples) {
-            Some(shares) => with_slopes(color, &shares.reshape(&[samples.len(), 1])),
+        match self.gradient_scale(samples) {
+            Some(shares) => scale_gradient(color, &shares.reshape(&[samples.len(), 1])),
             None => color,
         }
     }
 }
 
 /// The same values with scaled gradients.
-fn with_slopes<'t, T: Scalar>(x: Var<'t, T>, shares: &Tensor<T>) -> Var<'t, T> {
+fn scale_gradient<'t, T: Scalar>(x: Var<'t, T>, shares: &Tensor<T>) -> Var<'t, T> {
     // The added term is 0.
     let moved = (&x - x.detach()) * x.tape().constant(shares.clone());
     x.detach() + moved
@@ -156,7 +156,7 @@ mod tests {
         for (near, shares) in [(0.0, [1.0; 4]), (0.5, [1.0; 4]), (2.0, [1.0 / 16.0, 9.0 / 16.0, 1.0, 1.0])] {
             let tape = Tape::new();
             let bound = params.bind(&tape);
-            let query = Query { near, ..Query::new(&Here, &bound) };
+            let query = Query { gradient_scaling_distance: near, ..Query::new(&Here, &bound) };
             let weights = Tensor::from_vec(&[4], vec![1.0, 10.0, 100.0, 1000.0]);
             let expected = [1.0, 10.0, 100.0, 1000.0].iter().zip(shares).map(|(w, share)| w * share).sum::<f64>();
             let density = query.density(&samples);
@@ -182,7 +182,7 @@ mod tests {
                 let learned = |near: f64| {
                     let tape = Tape::new();
                     let bound = params.bind(&tape);
-                    let query = Query { near, ..Query::new(&Here, &bound) };
+                    let query = Query { gradient_scaling_distance: near, ..Query::new(&Here, &bound) };
                     let rendered = rule.render(&query, &steps, termination).rendered;
                     rendered.weights.sum().grad(&[bound.vars()[0]])[0].item()
                 };
@@ -196,7 +196,7 @@ mod tests {
     fn with_slopes_scales_gradients_alone() {
         let tape = Tape::<f64>::new();
         let x = tape.leaf(Tensor::from([[1.0, 2.0], [0.1, -1e300], [7.0, 0.0]]));
-        let y = with_slopes(x.clone(), &Tensor::from_vec(&[3, 1], vec![0.25, 0.0, 1.0]));
+        let y = scale_gradient(x.clone(), &Tensor::from_vec(&[3, 1], vec![0.25, 0.0, 1.0]));
         assert_eq!(y.value(), x.value());
         let grads = (y * 2.0).sum().grad(&[&x]);
         assert_eq!(grads[0].as_slice(), [0.5, 0.5, 0.0, 0.0, 2.0, 2.0]);

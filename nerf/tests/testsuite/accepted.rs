@@ -122,7 +122,7 @@ fn read(folder: &Path) -> Result<(Capture, SceneAnalysis)> {
 /// Trains one step on a capture and renders it.
 fn used((capture, survey): &(Capture, SceneAnalysis)) -> Result<Outcome> {
     let data = capture.load(Split::Train, survey, &LoadOptions::default())?;
-    let mut config = tiny().with_scene_type(data.scope);
+    let mut config = tiny().with_scene_type(data.scene_type);
     let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
     (sampler.samples, sampler.occupancy.resolution) = (256, 16);
     // Long steps save time: the number of samples per ray does not matter here.

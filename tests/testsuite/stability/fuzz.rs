@@ -333,7 +333,7 @@ fn campaign_states_of_optimisers() {
     };
     let whole = [state.to_safetensors().unwrap(), OptimizerState::<f32>::default().to_safetensors().unwrap()];
     let parse = |bytes: &[u8]| OptimizerState::<f32>::from_safetensors(bytes).map(drop);
-    alone(|| campaign("optimiser", &whole, Bound { times: 64, plus: 1 << 16 }, parse, |error| clear(error, "")));
+    alone(|| campaign("optimizer", &whole, Bound { times: 64, plus: 1 << 16 }, parse, |error| clear(error, "")));
 }
 
 /// Compressed arrays in an archive, written by NumPy: see `autograd/nn/tests/data/README.md`.

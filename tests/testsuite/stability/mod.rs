@@ -21,7 +21,7 @@ mod hash_grid;
 mod init;
 mod march;
 mod metrics;
-mod optimiser;
+mod optimizer;
 mod properties;
 mod rotation;
 mod sampling;

@@ -187,7 +187,7 @@ fn grid_cells<T: Scalar>(points: &[[f64; 3]]) -> Outcome {
 fn adam_steps<T: Scalar>(gradients: &[f64], table: bool) -> Outcome {
     let config = AdamConfig::default();
     let config = if table { AdamConfig { beta2: 0.99, eps: 1e-15, ..config } } else { config };
-    let bound = super::optimiser::bound(&config);
+    let bound = super::optimizer::bound(&config);
     let mut adam = Adam::<T>::new(config);
     let mut params = Params::new();
     let x = params.add("x", Tensor::zeros(&[1]));

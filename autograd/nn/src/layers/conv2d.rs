@@ -83,7 +83,7 @@ impl Conv2d {
 
 impl<T: Scalar> Layer<T> for Conv2d {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _mode: Mode) -> Var<'t, T> {
         self.forward(params, x)
     }
 }

@@ -41,8 +41,8 @@ impl Dropout {
     /// assert_eq!(dropout.forward(&x, Mode::Train(7)).value(), y.value());
     /// ```
     #[track_caller]
-    pub fn forward<'t, T: Scalar>(&self, x: &Var<'t, T>, pass: Mode) -> Var<'t, T> {
-        match pass {
+    pub fn forward<'t, T: Scalar>(&self, x: &Var<'t, T>, mode: Mode) -> Var<'t, T> {
+        match mode {
             Mode::Train(seed) if self.rate > 0.0 => x * x.tape().constant(self.mask(x, seed)),
             _ => x.clone(),
         }
@@ -63,8 +63,8 @@ impl Dropout {
 
 impl<T: Scalar> Layer<T> for Dropout {
     #[track_caller]
-    fn apply<'t>(&self, _params: &Bound<'t, T>, x: &Var<'t, T>, pass: Mode) -> Var<'t, T> {
-        self.forward(x, pass)
+    fn apply<'t>(&self, _params: &Bound<'t, T>, x: &Var<'t, T>, mode: Mode) -> Var<'t, T> {
+        self.forward(x, mode)
     }
 }
 

@@ -53,7 +53,7 @@ impl LayerNorm {
 
 impl<T: Scalar> Layer<T> for LayerNorm {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _mode: Mode) -> Var<'t, T> {
         self.forward(params, x)
     }
 }

@@ -57,7 +57,7 @@ impl Linear {
 
 impl<T: Scalar> Layer<T> for Linear {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _mode: Mode) -> Var<'t, T> {
         self.forward(params, x)
     }
 }

@@ -63,7 +63,7 @@ impl Mlp {
 
 impl<T: Scalar> Layer<T> for Mlp {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _mode: Mode) -> Var<'t, T> {
         self.forward(params, x)
     }
 }

@@ -32,7 +32,7 @@ pub trait Layer<T: Scalar>: Send + Sync {
     /// # Panics
     /// If the shape of `x` does not fit.
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Mode) -> Var<'t, T>;
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, mode: Mode) -> Var<'t, T>;
 }
 
 /// Evaluation or training. All randomness of a layer follows from the mode. So the same mode gives the same bits on any

@@ -40,7 +40,7 @@ where
     F: for<'t> Fn(&Var<'t, T>) -> Var<'t, T> + Send + Sync,
 {
     #[track_caller]
-    fn apply<'t>(&self, _params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
+    fn apply<'t>(&self, _params: &Bound<'t, T>, x: &Var<'t, T>, _mode: Mode) -> Var<'t, T> {
         (self.0)(x)
     }
 }
@@ -77,10 +77,10 @@ impl<T: Scalar> Sequential<T> {
     /// # Panics
     /// If a shape does not fit.
     #[track_caller]
-    pub fn forward<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Mode) -> Var<'t, T> {
+    pub fn forward<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, mode: Mode) -> Var<'t, T> {
         let mut h = x.clone();
         for (i, layer) in self.layers.iter().enumerate() {
-            h = layer.apply(params, &h, pass.part(i as u64));
+            h = layer.apply(params, &h, mode.part(i as u64));
         }
         h
     }
@@ -88,8 +88,8 @@ impl<T: Scalar> Sequential<T> {
 
 impl<T: Scalar> Layer<T> for Sequential<T> {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Mode) -> Var<'t, T> {
-        self.forward(params, x, pass)
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, mode: Mode) -> Var<'t, T> {
+        self.forward(params, x, mode)
     }
 }
 
@@ -157,8 +157,8 @@ mod tests {
         let x = tape.constant(Tensor::ones(&[4000]));
         // If both layers dropped the same elements, half would be left instead of a quarter.
         let two = Sequential::new().then(Dropout::new(0.5)).then(Dropout::new(0.5));
-        let left = |model: &Sequential<f64>, pass| {
-            let y = model.forward(&bound, &x, pass);
+        let left = |model: &Sequential<f64>, mode| {
+            let y = model.forward(&bound, &x, mode);
             y.value().as_slice().iter().map(|&y| y != 0.0).collect::<Vec<_>>()
         };
         let count = |left: &[bool]| left.iter().filter(|&&left| left).count();

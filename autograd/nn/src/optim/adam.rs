@@ -211,8 +211,8 @@ impl<T: Scalar> Adam<T> {
             if part.lazy {
                 group.correct_rows();
             }
-            let (group, rate) = (&*group, part.rate);
-            let update = group.update(rate, part.decay);
+            let (group, rate) = (&*group, part.lr);
+            let update = group.update(rate, part.weight_decay);
             let whole = |step| {
                 let [first, second] = biases(group.config, step);
                 let root = second.sqrt();
@@ -357,11 +357,11 @@ mod tests {
         let grad = Tensor::from_vec(&[4], vec![1.0, f32::NAN, f32::INFINITY, -1.0]);
         let report = adam.update(&mut params, &[grad.into()], 1e30);
         assert_eq!(
-            (report.moved, report.skipped, report.has_only_non_finite()),
+            (report.updated, report.skipped, report.has_only_non_finite()),
             (1, 3, false),
             "the last step overflows"
         );
-        assert_eq!(report.bad, [("x".to_owned(), 3)]);
+        assert_eq!(report.non_finite, [("x".to_owned(), 3)]);
         let message = report.check().unwrap_err().to_string();
         assert_eq!(
             message,

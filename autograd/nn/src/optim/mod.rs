@@ -38,9 +38,9 @@ pub struct ParamUpdate<'a, T: Scalar> {
     /// Its gradient, of the same shape and not empty.
     pub grad: &'a Gradient<T>,
     /// Its learning rate, including its lr scale.
-    pub rate: f64,
+    pub lr: f64,
     /// Its factor of the optimizer's weight decay.
-    pub decay: f64,
+    pub weight_decay: f64,
     /// Whether to update only the rows whose gradient is not zero ([`Params::set_lazy`]).
     pub lazy: bool,
 }

@@ -11,20 +11,20 @@ use std::fmt;
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct UpdateReport {
     /// Number of updated elements. For a lazy parameter, those of the rows with a gradient.
-    pub moved: usize,
+    pub updated: usize,
     /// Number of skipped elements, whose gradient or new value is infinite or NaN.
     pub skipped: usize,
     /// The parameters with skipped elements, and the number of these.
-    pub bad: Vec<(String, usize)>,
+    pub non_finite: Vec<(String, usize)>,
 }
 
 impl UpdateReport {
     /// Adds the numbers of one parameter.
     pub fn count(&mut self, name: &str, moved: usize, skipped: usize) {
-        self.moved += moved;
+        self.updated += moved;
         self.skipped += skipped;
         if skipped > 0 {
-            self.bad.push((name.to_owned(), skipped));
+            self.non_finite.push((name.to_owned(), skipped));
         }
     }
 
@@ -33,13 +33,13 @@ impl UpdateReport {
     /// # Errors
     /// If elements were skipped.
     pub fn check(self) -> Result<usize, NonFinite> {
-        if self.skipped == 0 { Ok(self.moved) } else { Err(NonFinite(self)) }
+        if self.skipped == 0 { Ok(self.updated) } else { Err(NonFinite(self)) }
     }
 
     /// Whether every element with a gradient was skipped, and there were some. One such step may be an overflow. If
     /// every step is like this, the run has diverged.
     pub fn has_only_non_finite(&self) -> bool {
-        self.moved == 0 && self.skipped > 0
+        self.updated == 0 && self.skipped > 0
     }
 }
 
@@ -54,7 +54,7 @@ impl std::error::Error for NonFinite {}
 
 impl fmt::Display for NonFinite {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let UpdateReport { moved, skipped, bad } = &self.0;
+        let UpdateReport { updated: moved, skipped, non_finite: bad } = &self.0;
         let what = "elements were not updated, because the gradient or the new value is not finite:";
         write!(f, "{skipped} of {} {what}", moved + skipped)?;
         for (place, (name, count)) in bad.iter().enumerate() {

@@ -12,7 +12,8 @@ pub enum Schedule {
     /// A constant rate.
     Constant {
         /// Learning rate. Range: 0 to 1e30.
-        rate: f64,
+        #[serde(alias = "rate")]
+        lr: f64,
     },
     /// Linear: `from + (to - from) fraction`, after a linear warm-up from 0. With `to` equal to `from` it is constant
     /// after the warm-up.
@@ -74,7 +75,7 @@ impl Schedule {
         let fraction = fraction.clamp(0.0, 1.0);
         let rise = |warmup: f64| if fraction < warmup { fraction / warmup } else { 1.0 };
         match *self {
-            Schedule::Constant { rate } => rate,
+            Schedule::Constant { lr: rate } => rate,
             Schedule::Linear { from, to, warmup } => rise(warmup) * (from + (to - from) * fraction),
             Schedule::Step { from, factor, every, warmup } => {
                 // A fraction such as 0.3 is a little less than three times 0.1.
@@ -98,7 +99,7 @@ impl Schedule {
         let check_warmup = |warmup| check("warmup", warmup, (0.0..=1.0).contains(&warmup), "0 to 1");
         let check_ratio = |name, rate| check(name, rate, rate > 0.0, "more than 0");
         match *self {
-            Schedule::Constant { rate } => check_rate("rate", rate),
+            Schedule::Constant { lr: rate } => check_rate("rate", rate),
             Schedule::Linear { from, to, warmup } | Schedule::Cosine { from, to, warmup } => {
                 check_rate("from", from)?;
                 check_rate("to", to)?;
@@ -153,7 +154,7 @@ mod tests {
 
     #[test]
     fn every_form_passes_its_points() {
-        assert_rates(Schedule::Constant { rate: 0.3 }, &[(-1.0, 0.3), (0.0, 0.3), (1.0, 0.3)]);
+        assert_rates(Schedule::Constant { lr: 0.3 }, &[(-1.0, 0.3), (0.0, 0.3), (1.0, 0.3)]);
         let linear = Schedule::Linear { from: 1.0, to: 0.2, warmup: 0.5 };
         assert_rates(linear, &[(0.0, 0.0), (0.25, 0.5 * 0.8), (0.5, 0.6), (1.0, 0.2), (7.0, 0.2)]);
         let flat = Schedule::Linear { from: 0.4, to: 0.4, warmup: 0.1 };
@@ -172,7 +173,7 @@ mod tests {
     #[test]
     fn numbers_out_of_range_are_named() {
         let good = [
-            Schedule::Constant { rate: 0.0 },
+            Schedule::Constant { lr: 0.0 },
             Schedule::Linear { from: 1.0, to: 0.0, warmup: 1.0 },
             Schedule::Cosine { from: 0.0, to: 2.0, warmup: 0.0 },
             Schedule::Step { from: 1.0, factor: 1.0, every: 1.0, warmup: 0.5 },
@@ -180,8 +181,8 @@ mod tests {
         ];
         assert!(good.iter().all(|schedule| schedule.check().is_ok()));
         for (schedule, expected) in [
-            (Schedule::Constant { rate: 1e300 }, "`rate` is 1e300; use 0 to 1e30"),
-            (Schedule::Constant { rate: f64::NAN }, "`rate` is NaN; use 0 to 1e30"),
+            (Schedule::Constant { lr: 1e300 }, "`lr` is 1e300; use 0 to 1e30"),
+            (Schedule::Constant { lr: f64::NAN }, "`lr` is NaN; use 0 to 1e30"),
             (Schedule::Linear { from: -1.0, to: 0.0, warmup: 0.0 }, "`from` is -1.0; use 0 to 1e30"),
             (Schedule::Cosine { from: 1.0, to: f64::INFINITY, warmup: 0.0 }, "`to` is inf; use 0 to 1e30"),
             (Schedule::Linear { from: 1.0, to: 0.0, warmup: 1.5 }, "`warmup` is 1.5; use 0 to 1"),

@@ -32,7 +32,7 @@ pub struct SgdConfig {
     /// Whether to use Nesterov momentum.
     pub nesterov: bool,
     /// Weight decay: `decay` times the parameter is added to the gradient. Range: 0 to 1e30.
-    pub decay: f64,
+    pub weight_decay: f64,
 }
 
 impl SgdConfig {
@@ -43,7 +43,7 @@ impl SgdConfig {
     pub fn check(&self) -> Result<(), SettingError> {
         check_share("momentum", self.momentum)?;
         check("momentum", self.momentum, !self.nesterov || self.momentum > 0.0, "more than 0 to look ahead")?;
-        check_rate("decay", self.decay)
+        check_rate("decay", self.weight_decay)
     }
 }
 
@@ -64,9 +64,9 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
     fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport {
         let mut report = UpdateReport::default();
         for part in params.updates(grads, |_| rate) {
-            let decay = self.config.decay * part.decay;
+            let decay = self.config.weight_decay * part.weight_decay;
             let update = Update {
-                rate: T::from_f64(part.rate),
+                rate: T::from_f64(part.lr),
                 momentum: T::from_f64(self.config.momentum),
                 nesterov: self.config.nesterov,
                 decay: T::from_f64(decay),
@@ -149,7 +149,7 @@ mod tests {
         for (momentum, nesterov, decay) in
             [(0.0, false, 0.0), (0.0, false, 0.1), (0.9, false, 0.0), (0.9, true, 0.0), (0.7, true, 0.05)]
         {
-            let mut sgd = Sgd::<f64>::new(SgdConfig { momentum, nesterov, decay });
+            let mut sgd = Sgd::<f64>::new(SgdConfig { momentum, nesterov, weight_decay: decay });
             let mut params = store(Tensor::from_vec(&[2], vec![0.5, -1.5]));
             let (mut x, mut v) = ([0.5, -1.5], [0.0; 2]);
             for t in 0..300 {
@@ -189,7 +189,7 @@ mod tests {
     #[test]
     fn sgd_non_finite_gradients_are_skipped_and_counted() {
         for momentum in [0.0, 0.9] {
-            let mut sgd = Sgd::<f32>::new(SgdConfig { momentum, decay: 0.5, ..SgdConfig::default() });
+            let mut sgd = Sgd::<f32>::new(SgdConfig { momentum, weight_decay: 0.5, ..SgdConfig::default() });
             let start = [1.0, 2.0, 3.0, -3e38, 1e-25];
             let mut params = store(Tensor::from_vec(&[5], start.to_vec()));
             let grad = Tensor::from_vec(&[5], vec![f32::NAN, f32::NEG_INFINITY, 1.0, 3e38, 0.0]);

@@ -113,7 +113,7 @@ impl<T: Scalar> OptimizerState<T> {
 
     /// An error if an entry is left.
     pub(crate) fn refuse_rest(&self) -> Result<(), StateError> {
-        let what = "is unknown: the state belongs to another optimiser or other parameters";
+        let what = "is unknown: the state belongs to another optimizer or other parameters";
         self.tensors.keys().chain(self.counts.keys()).min().map_or(Ok(()), |name| Err(StateError::entry(name, what)))
     }
 }

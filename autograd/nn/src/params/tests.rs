@@ -17,7 +17,7 @@ fn frozen_parameters_rest_others_have_own_lr() {
     assert_eq!((params.elements(), params.trainable_elements(), params.ids().count()), (6, 4, 3));
     assert_eq!(params.names().collect::<Vec<_>>(), ["trunk.weight", "trunk.bias", "head.weight"]);
 
-    let mut sgd = Sgd::new(SgdConfig { decay: 1.0, ..SgdConfig::default() });
+    let mut sgd = Sgd::new(SgdConfig { weight_decay: 1.0, ..SgdConfig::default() });
     let step = |params: &mut Params<f64>, sgd: &mut Sgd<f64>| {
         let tape = Tape::new();
         let bound = params.bind(&tape);

@@ -1,4 +1,4 @@
-"""Writes optim.npz, the reference values of tests/testsuite/optim_peers.rs: ten steps of PyTorch's optimisers and what belongs to
+"""Writes optim.npz, the reference values of tests/testsuite/optim_peers.rs: ten steps of PyTorch's optimizers and what belongs to
 them, in f64.
 
     pip install numpy torch                  # torch 2.15, numpy 2.4 wrote the committed file

@@ -2,4 +2,4 @@
 
 mod concurrency;
 mod optim_peers;
-mod optimisers;
+mod optimizers;

@@ -1,4 +1,4 @@
-//! Ten steps of every optimiser, clipping, averages and schedules against PyTorch in f64. `reference/make_optim.py` says
+//! Ten steps of every optimizer, clipping, averages and schedules against PyTorch in f64. `reference/make_optim.py` says
 //! what the reference holds and writes it.
 
 use raygrad_autograd::{Gradient, RowGrad, Scalar, Tensor};
@@ -68,7 +68,7 @@ fn close<T: Scalar>(what: &str, got: &Tensor<T>, expected: &Tensor<f64>) {
 }
 
 fn sgd(momentum: f64, nesterov: bool, decay: f64) -> SgdConfig {
-    SgdConfig { momentum, nesterov, decay }
+    SgdConfig { momentum, nesterov, weight_decay: decay }
 }
 
 fn adam(beta1: f64, beta2: f64, epsilon: f64) -> AdamConfig {
@@ -182,8 +182,8 @@ fn learning_rates() {
 fn nothing_of_the_reference_is_left_out() {
     let mut known: BTreeSet<String> =
         ["rates", "table", "shares", "sparse_adam", "clip.norms"].map(String::from).into_iter().collect();
-    let optimisers = cases::<f64>();
-    let pairs = optimisers.iter().map(|(case, _)| *case).chain(["start", "grads", "clip", "ema"]);
+    let optimizers = cases::<f64>();
+    let pairs = optimizers.iter().map(|(case, _)| *case).chain(["start", "grads", "clip", "ema"]);
     known.extend(pairs.flat_map(|case| ["a", "b"].map(|name| format!("{case}.{name}"))));
     known.extend(["cosine", "exponential", "step", "linear", "warmup"].map(|name| format!("schedule.{name}")));
     assert_eq!(Reference::read().arrays.names().map(String::from).collect::<BTreeSet<_>>(), known);

@@ -100,7 +100,7 @@ fn cameras_scale_with_their_images() {
     assert!((frame.camera.centre[0] - 13.0 / 12.0).abs() < 1e-12 && (frame.camera.centre[1] - 7.0 / 8.0).abs() < 1e-12);
     assert!((frame.camera.focal[0] - view.camera.focal[0] / 12.0).abs() < 1e-12);
     let eye = survey.transform.point(view.camera.pose.translation);
-    assert!(frame.camera.pose.translation.distance(eye) < 1e-12 && data.placement == survey.transform);
+    assert!(frame.camera.pose.translation.distance(eye) < 1e-12 && data.transform == survey.transform);
     assert_eq!(seen.lock().unwrap().iter().max(), Some(&(3, 3)));
     let full = capture.load(Split::Train, &survey, &LoadOptions::default()).unwrap();
     assert_eq!(full.frames[0].image.bytes(), 12 * 8 * 3);

@@ -38,17 +38,17 @@ impl HashGridConfig {
     /// Returns values for CPUs: more features on fewer levels, which need fewer memory accesses, sized for a training
     /// budget.
     ///
-    /// `samples` is that of the whole [training](crate::Budget::samples). `footprints` is
+    /// `samples` is that of the whole [training](crate::Budget::samples). `pixels_per_side` is
     /// [`Dataset::pixels_per_side`](crate::dataset::Dataset::pixels_per_side): no cell is smaller than half a pixel.
     /// Larger tables hold more detail but take longer, above all beyond the caches.
-    pub fn cpu(samples: f64, footprints: f64) -> Self {
+    pub fn cpu(samples: f64, pixels_per_side: f64) -> Self {
         let (log2_table, finest) = match samples {
             ..=2e8 => (17, 512),
             ..=6e8 => (18, 512),
             _ => (19, 768),
         };
         let coarsest = 16;
-        let finest = ((2.0 * footprints).ceil() as usize).clamp(2 * coarsest, finest);
+        let finest = ((2.0 * pixels_per_side).ceil() as usize).clamp(2 * coarsest, finest);
         HashGridConfig { levels: 8, features: 4, log2_table, coarsest, finest }
     }
 

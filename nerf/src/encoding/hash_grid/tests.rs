@@ -71,8 +71,8 @@ fn paper_grid_has_the_papers_levels() {
 
 #[test]
 fn hash_grid_size_follows_budget_and_resolution() {
-    let size = |samples: f64, footprints: f64| {
-        let config = HashGridConfig::cpu(samples, footprints);
+    let size = |samples: f64, pixels_per_side: f64| {
+        let config = HashGridConfig::cpu(samples, pixels_per_side);
         let grid = HashGrid::new(&config).unwrap();
         assert_eq!(grid.levels()[7].resolution as usize, config.finest);
         (config.log2_table, config.finest)
@@ -264,7 +264,7 @@ fn hash_table_any_threads_give_same_bits() {
         (params.values()[0].clone(), reports)
     };
     let one = run(1);
-    assert!(one.1.iter().all(|report| report.moved > 2000 && report.skipped == 0));
+    assert!(one.1.iter().all(|report| report.updated > 2000 && report.skipped == 0));
     assert!(one == run(2) && one == run(4));
 }
 
@@ -283,7 +283,7 @@ fn sparse_hash_update_equals_dense_update() {
     }
     let (mut params, gradient) = store(&grid, &tiles);
     let report = Adam::new(AdamConfig::default()).update(&mut params, &[gradient], 1e-2);
-    assert_eq!(report.moved, 2 * dense.chunks(2).filter(|row| *row != [0.0; 2]).count());
+    assert_eq!(report.updated, 2 * dense.chunks(2).filter(|row| *row != [0.0; 2]).count());
     // Adam's first step is the learning rate against the gradient's sign.
     for ((after, before), g) in params.values()[0].as_slice().iter().zip(start.as_slice()).zip(&dense) {
         let expected = if *g == 0.0 { 0.0 } else { -1e-2 * g.signum() };
@@ -300,7 +300,7 @@ fn sparse_hash_update_equals_dense_update() {
     assert_eq!(scattered, gradient.clone().into_dense(&Pool::none()).as_slice());
     let dense = Gradient::from(gradient.into_dense(&Pool::none()));
     let again = Adam::new(AdamConfig::default()).update(&mut other, &[dense], 1e-2);
-    assert_eq!((again.moved, other.values()), (report.moved, params.values()));
+    assert_eq!((again.updated, other.values()), (report.updated, params.values()));
 }
 
 #[test]

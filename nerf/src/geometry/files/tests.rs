@@ -177,7 +177,7 @@ fn shapes_are_written_in_capture_coordinates() {
     let mut shape = points();
     shape.mesh.positions[0] = DVec3::new(1.0, 2.0, 3.0);
     shape.normals[0] = DVec3::Y;
-    let (place, back) = (shape.mesh.positions[1], shape.placed_back(&placement));
+    let (place, back) = (shape.mesh.positions[1], shape.into_capture(&placement));
     assert!(back.mesh.positions[0].abs_diff_eq(DVec3::new(10.0 + 4.0, 20.0 - 2.0, 30.0 + 6.0), 1e-12));
     assert!(back.normals[0].abs_diff_eq(DVec3::X, 1e-12), "a direction has no length to scale: {}", back.normals[0]);
     assert!(placement.point(back.mesh.positions[1]).abs_diff_eq(place, 1e-9));

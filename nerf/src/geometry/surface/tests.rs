@@ -277,7 +277,7 @@ impl Field<f32> for Hollow {
 
 #[test]
 fn surface_colors_have_the_exposure_of_renders() {
-    let rate = Some(raygrad_nn::Schedule::Constant { rate: 0.1 });
+    let rate = Some(raygrad_nn::Schedule::Constant { lr: 0.1 });
     let mut config = Config::preset(Preset::Voxel);
     config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
     config.exposure_model = crate::model::ExposureConfig { exposure: rate, vignetting: rate };

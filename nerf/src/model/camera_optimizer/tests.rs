@@ -41,7 +41,7 @@ fn cameras() -> Vec<Camera> {
 }
 
 fn all() -> CameraOptimizerConfig {
-    let rate = Some(Schedule::Constant { rate: 1e-3 });
+    let rate = Some(Schedule::Constant { lr: 1e-3 });
     CameraOptimizerConfig { focal: rate, lens: rate, coarse: 0.0 }
 }
 
@@ -279,14 +279,15 @@ fn model_tells_cameras_whether_scene_is_unbounded() {
     let cameras = cameras();
     let bounded = Config { poses: all().focal, ..Config::preset(Preset::Voxel) };
     let unbounded = bounded.clone().with_scene_type(SceneType::Unbounded);
-    for (config, goes_on) in [(bounded, false), (unbounded, true)] {
+    for (config, unbounded) in [(bounded, false), (unbounded, true)] {
         let model = Model::<f32>::with_cameras(config, extent(6), &cameras, 0).unwrap();
         let mut params = Params::<f32>::new();
         let none = CameraOptimizerConfig::default();
-        let new = |goes_on, params: &mut _| CameraOptimizer::new(true, &none, (&extent(6), goes_on), &cameras, params);
-        let expected = new(goes_on, &mut params).unwrap().unwrap();
-        let other = new(!goes_on, &mut Params::<f32>::new()).unwrap().unwrap();
+        let new =
+            |unbounded, params: &mut _| CameraOptimizer::new(true, &none, (&extent(6), unbounded), &cameras, params);
+        let expected = new(unbounded, &mut params).unwrap().unwrap();
+        let other = new(!unbounded, &mut Params::<f32>::new()).unwrap().unwrap();
         let found = &model.camera_optimizer.as_ref().unwrap().balance;
-        assert!(*found == expected.balance && *found != other.balance, "{goes_on}");
+        assert!(*found == expected.balance && *found != other.balance, "{unbounded}");
     }
 }

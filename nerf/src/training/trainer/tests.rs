@@ -42,7 +42,7 @@ fn forward_facing_fields_use_ndc() {
     let ndc = data.ndc.unwrap();
     assert!(data.frames.iter().all(|frame| ndc.pixels(&frame.camera, DVec3::ZERO) < 20.0));
     assert!((data.pixels_per_side() - ndc.pixels(&data.frames[2].camera, DVec3::ZERO)).abs() < 2.0);
-    let config = tiny_table().with_scene_type(data.scope);
+    let config = tiny_table().with_scene_type(data.scene_type);
     let trainer = Trainer::new(config.clone(), Arc::new(data.clone())).unwrap();
     assert_eq!(trainer.model.scene_box.ndc, Some(ndc));
     // In front of the near plane, all points of a ray from the eye are equal; without NDC they differ.
@@ -55,7 +55,7 @@ fn forward_facing_fields_use_ndc() {
     };
     let [a, b, c] = densities(&trainer);
     assert!((a - b).abs() < 1e-7 && (a - c).abs() > 1e-6, "{a} {b} {c}");
-    let unbounded = Dataset { scope: SceneType::Unbounded, ..data.clone() };
+    let unbounded = Dataset { scene_type: SceneType::Unbounded, ..data.clone() };
     assert!(unbounded.pixels_per_side() != data.pixels_per_side());
     let other = Trainer::new(config.clone(), Arc::new(unbounded)).unwrap();
     assert_eq!(other.model.scene_box.ndc, None);
@@ -332,10 +332,10 @@ fn restart_draws_other_rays() {
 
 #[test]
 fn optimizer_settings_are_checked() {
-    let mut config = Config { schedule: Schedule::Constant { rate: 1e300 }, ..tiny() };
+    let mut config = Config { schedule: Schedule::Constant { lr: 1e300 }, ..tiny() };
     let message = |config: &Config| config.check().unwrap_err().to_string();
-    assert_eq!(message(&config), "`schedule.constant.rate`: is 1e300; use 0 to 1e30");
-    config.schedule = Schedule::Constant { rate: 0.1 };
+    assert_eq!(message(&config), "`schedule.constant.lr`: is 1e300; use 0 to 1e30");
+    config.schedule = Schedule::Constant { lr: 0.1 };
     config.adam.beta1 = 1.0;
     assert_eq!(message(&config), "`adam.beta1`: is 1.0; use at least 0 and less than 1");
     config.adam.beta1 = 0.0;

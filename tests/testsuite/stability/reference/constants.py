@@ -83,7 +83,7 @@ for name, value in [("x", -x / z), ("y", -y / z), ("z", 1 + 2 / z)]:
     row(f"normalised device coordinates, {name}", (value + 1) / 2)
 row("contraction of norm 1e4", 2 - mpf("1e-4"))
 
-# Reductions, optimiser, metrics.
+# Reductions, optimizer, metrics.
 f = lambda beta: 1 - f32(beta)
 row("1 - .999 in f32, relative error", abs(f(".999") / (1 - mpf(".999")) - 1), "1.3e-5")
 for epsilon, written in [("1e-8", ".0099"), ("1e-15", "1.0")]:

@@ -6,7 +6,7 @@ use raygrad_autograd::{Gradient, RowGrad, RowShare, SparseGrad};
 use raygrad_tensor::Tensor;
 use std::sync::Arc;
 
-/// A table alone in a store, and its optimiser.
+/// A table alone in a store, and its optimizer.
 struct Alone<T: Scalar> {
     params: Params<T>,
     adam: Adam<T>,
@@ -102,7 +102,7 @@ fn lazy_rows_without_gradient_rest() {
         (grad[2], grad[7], grad[9]) = (1.0, f32::NAN, f32::INFINITY);
         let report = table.against(&grad, 0.1);
         // Rows 1, 3 and 4 have a gradient.
-        assert_eq!((report.moved, report.skipped), (if lazy { 4 } else { 30 }, 2));
+        assert_eq!((report.updated, report.skipped), (if lazy { 4 } else { 30 }, 2));
         let moved: Vec<_> = (0..32).filter(|&i| table.values()[i] != 1.0).collect();
         assert_eq!(moved, [2], "row 1 moves, and in it the element that has a gradient");
         let state = table.adam.state(&table.params);
@@ -113,7 +113,7 @@ fn lazy_rows_without_gradient_rest() {
         let mut table = Alone::<f32>::new(Adam::new(AdamConfig::default()), [2, 1], f64::from(f32::MAX), lazy);
         table.params.set_lr_scale(|_| true, 1e30);
         let report = table.against(&[-1.0, 1.0], 1e8);
-        assert_eq!((report.moved, report.skipped), (1, 1));
+        assert_eq!((report.updated, report.skipped), (1, 1));
         assert!(table.values()[0] == f32::MAX && table.values()[1].is_finite(), "{:?}", table.values());
         table.params.set_lr_scale(|_| true, f64::MAX);
         assert_eq!(table.against(&[-1.0, 1.0], 1.0).skipped, 2);

@@ -152,14 +152,14 @@ fn bad_gradients_are_skipped_and_counted<T: Scalar>() {
 fn a_hundred_thousand_steps_without_gradient<T: Scalar>() {
     let mut params = Params::<T>::new();
     let id = params.add("x", vector(&[1.0, -2.0, 1e-20, 0.0]));
-    let mut optimisers: Vec<Box<dyn Optimizer<T>>> = vec![
+    let mut optimizers: Vec<Box<dyn Optimizer<T>>> = vec![
         Box::new(Adam::new(AdamConfig::default())),
         Box::new(Adam::new(TABLE)),
         Box::new(AdamW::new(AdamConfig::default(), 0.01)),
         Box::new(Sgd::new(SgdConfig { momentum: 0.9, ..SgdConfig::default() })),
     ];
     let zeros = [Gradient::from(Tensor::zeros(&[4]))];
-    for (k, optimizer) in optimisers.iter_mut().enumerate() {
+    for (k, optimizer) in optimizers.iter_mut().enumerate() {
         step(&mut **optimizer, &mut params, vector(&[1.0, -1.0, 1e-12, 1e-30]), 1e-3);
         let mut last = numbers(params.get(id));
         let mut rest = None;
@@ -167,7 +167,7 @@ fn a_hundred_thousand_steps_without_gradient<T: Scalar>() {
             optimizer.update(&mut params, &zeros, 1e-3).check().unwrap();
             let now = numbers(params.get(id));
             let denormal = |x: &f64| *x != 0.0 && x.abs() < by_type::<T>(f32::MIN_POSITIVE.into(), f64::MIN_POSITIVE);
-            assert!(now.iter().all(|x| x.is_finite() && !denormal(x)), "optimiser {k}, step {step}: {now:?}");
+            assert!(now.iter().all(|x| x.is_finite() && !denormal(x)), "optimizer {k}, step {step}: {now:?}");
             if now == last && rest.is_none() {
                 rest = Some(step);
             } else if now != last {
@@ -176,7 +176,7 @@ fn a_hundred_thousand_steps_without_gradient<T: Scalar>() {
             last = now;
         }
         // Without decay everything stops once the momentum is flushed.
-        assert!(k == 2 || rest.is_some_and(|step| step < 2000), "optimiser {k} comes to rest at {rest:?}");
+        assert!(k == 2 || rest.is_some_and(|step| step < 2000), "optimizer {k} comes to rest at {rest:?}");
     }
 }
 
