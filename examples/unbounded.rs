@@ -13,7 +13,7 @@
 use raygrad::nerf::dataset::{Dataset, SceneType, Split, evenly_spaced};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::imaging::metrics::psnr_from_mse;
-use raygrad::nerf::sampling::proposal::{ProposalConfig, Spacing};
+use raygrad::nerf::sampling::proposal::ProposalConfig;
 use raygrad::nerf::{Background, Budget, Config, Model, Preset, Result, SamplerConfig, Trainer};
 use raygrad_scenes::{landscape, landscape_ahead, landscape_distances};
 use std::ops::ControlFlow;
@@ -70,7 +70,7 @@ fn main() -> Result<()> {
         let data = Dataset { scene_type: scope, ..train.clone() };
         let mut config = usual.clone().for_budget(budget.samples(), data.pixels_per_side()).with_scene_type(scope);
         if name == "contraction" {
-            let proposal = ProposalConfig { spacing: Spacing::Disparity, ..ProposalConfig::default() };
+            let proposal = ProposalConfig::default();
             config.sampler = SamplerConfig::new(proposal);
         }
         let mut trainer = Trainer::new(config, Arc::new(data))?;

@@ -12,7 +12,6 @@ use crate::range::{check_range, check_schedule};
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
-use crate::sampling::proposal::{ProposalConfig, Spacing};
 use crate::space::occupancy::Skip;
 use crate::volume::quadrature::Quadrature;
 use crate::{Error, Result};
@@ -262,7 +261,7 @@ impl Config {
 
     /// Adapts the configuration to the type of scene; a second call with the same type changes nothing.
     ///
-    /// For an unbounded scene it marches through cascades with growing steps and spreads proposals in inverse distance.
+    /// For an unbounded scene it marches through cascades with growing steps.
     /// It doubles the resolution of a hash grid and adds a [distortion loss](DistortionConfig) against fog. It
     /// overrides the steps of [`for_budget`](Self::for_budget). Figures are in docs/benchmarks/results.md, section
     /// Captures.
@@ -283,9 +282,6 @@ impl Config {
                 *marching =
                     MarchingConfig { occupancy: marching.occupancy, samples: marching.samples / SAMPLES, ..usual };
             }
-        }
-        if let Some(proposal) = self.sampler.get_mut::<ProposalConfig>() {
-            proposal.spacing = if self.unbounded { Spacing::Disparity } else { Spacing::Linear };
         }
         let field = self.field.get_mut::<InstantConfig>();
         if self.unbounded {
@@ -414,6 +410,15 @@ mod tests {
     use super::*;
 
     #[test]
+    fn classic_preset_has_the_sizes_of_the_paper() {
+        let field = Config::preset(Preset::Classic).field;
+        let classic = field.get::<ClassicConfig>().unwrap();
+        let sizes = (classic.depth, classic.width, classic.view_width, classic.skip_layers.clone());
+        assert_eq!(sizes, (8, 256, 128, vec![5]));
+        assert_eq!((classic.position_levels, classic.direction_levels), (10, 4));
+    }
+
+    #[test]
     fn refined_params_have_their_own_schedule() {
         let refined = |part| Config::preset(Preset::Instant).with_refined(&[part]);
         let rate = |from, to| Some(Schedule::Exponential { from, to, warmup: 0.1 });
@@ -496,12 +501,6 @@ mod tests {
         open.check().unwrap();
         assert_eq!((samples(&skipped), samples(&open)), (16 * 256, 4 * 16 * 256));
         assert_eq!(open.with_scene_type(SceneType::Bounded), skipped);
-        // Proposals are spaced in inverse distance.
-        let proposal = Config { sampler: SamplerConfig::new(ProposalConfig::default()), ..preset.clone() };
-        let spacing = |config: &Config| config.sampler.get::<ProposalConfig>().unwrap().spacing;
-        let open = proposal.clone().with_scene_type(SceneType::Unbounded);
-        assert_eq!((spacing(&proposal), spacing(&open)), (Spacing::Linear, Spacing::Disparity));
-        assert_eq!(open.with_scene_type(SceneType::Bounded), proposal);
         let long = Config::preset(Preset::Instant).for_budget(1.2e9, 400.0).with_scene_type(SceneType::Unbounded);
         assert_eq!(long.sampler.get::<MarchingConfig>().unwrap().last_step, None);
     }

@@ -17,14 +17,13 @@ use raygrad_nn::Bound;
 use serde::{Deserialize, Serialize};
 
 /// The spacing of the first samples along a ray.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Spacing {
     /// Evenly in distance.
-    #[default]
     Linear,
-    /// Evenly in inverse distance, for unbounded scenes (Barron et al. 2022, section 4). Rays then begin no nearer
-    /// than a thousandth of their far end.
+    /// For unbounded scenes: evenly up to 1 scene unit from the camera, then evenly in inverse distance. These are the
+    /// piecewise samples of nerfacto (Tancik et al. 2023, section 4.1), after Barron et al. 2022, section 4.
     Disparity,
 }
 
@@ -53,8 +52,8 @@ pub struct ProposalConfig {
     /// Training steps over which the proposal weights reach their full effect (Barron et al. 2022, section 4,
     /// "annealing"). Unit: steps.
     pub anneal: u64,
-    /// Spacing of the first samples of a ray.
-    pub spacing: Spacing,
+    /// Spacing of the first samples of a ray. null: disparity in an unbounded scene, else linear.
+    pub spacing: Option<Spacing>,
     /// Rays in a training step. Range: 1 to 1048576.
     pub batch: usize,
     /// Rays in a tile, which one core computes on one tape. Range: 1 to 65536.
@@ -78,7 +77,7 @@ impl Default for ProposalConfig {
             samples: 16,
             uniform_share: 0.01,
             anneal: 500,
-            spacing: Spacing::Linear,
+            spacing: None,
             batch: 2048,
             tile: 256,
             early_stop_eps: 1e-3,
@@ -110,7 +109,9 @@ impl ComponentConfig<Samplers> for ProposalConfig {
             let name = format!("proposal.{i}");
             fields.push(Proposer(DensityNetwork::new(&level.grid, level.width, 1, site.child(&name))?));
         }
-        Ok(Box::new(Proposal { config: self.clone(), fields, trust: 0.0 }))
+        let usual = if site.space.unbounded { Spacing::Disparity } else { Spacing::Linear };
+        let spacing = self.spacing.unwrap_or(usual);
+        Ok(Box::new(Proposal { config: self.clone(), spacing, fields, trust: 0.0 }))
     }
 }
 
@@ -138,32 +139,37 @@ impl<T: Scalar> Field<T> for Proposer {
 pub struct Proposal {
     /// The configuration.
     pub config: ProposalConfig,
+    spacing: Spacing,
     fields: Vec<Proposer>,
     /// The annealing exponent of the proposals' weights: 0 ignores them.
     trust: f64,
 }
 
-/// The least distance of a ray in disparity, as a share of its far end: disparity is infinite at 0.
-const NEAREST: f64 = 1e-3;
-
-/// The map between distances along a ray and shares that are uniform in the spacing.
+/// The map from shares of a ray's span, even in the spacing, to distances.
 struct Scale {
+    /// Near and far, in the coordinate in which samples are even.
     ends: [f64; 2],
-    disparity: bool,
+    spacing: Spacing,
 }
 
 impl Scale {
     fn new<T: Scalar>(spacing: Spacing, span: [T; 2]) -> Self {
-        let [near, far] = span.map(T::to_f64);
-        let disparity = spacing == Spacing::Disparity && far > 0.0;
-        let near = if disparity { near.max(NEAREST * far) } else { near };
-        Scale { ends: if disparity { [1.0 / near, 1.0 / far] } else { [near, far] }, disparity }
+        let ends = span.map(|t| match (spacing, t.to_f64()) {
+            (Spacing::Linear, t) => t,
+            (Spacing::Disparity, t) if t < 1.0 => 0.5 * t,
+            (Spacing::Disparity, t) => 1.0 - 0.5 / t,
+        });
+        Scale { ends, spacing }
     }
 
     fn distance(&self, share: f64) -> f64 {
         let [near, far] = self.ends;
         let place = near + share * (far - near);
-        if self.disparity { 1.0 / place } else { place }
+        match self.spacing {
+            Spacing::Linear => place,
+            Spacing::Disparity if place < 0.5 => 2.0 * place,
+            Spacing::Disparity => 0.5 / (1.0 - place),
+        }
     }
 }
 
@@ -183,7 +189,7 @@ impl Proposal {
         let mut edges = Vec::with_capacity(shares.len());
         let mut out = t.as_mut_slice().iter_mut().zip(delta.as_mut_slice());
         for (span, shares) in rays.spans.iter().zip(shares.chunks_exact(bins + 1)) {
-            let scale = Scale::new(self.config.spacing, *span);
+            let scale = Scale::new(self.spacing, *span);
             let first = edges.len();
             edges.extend(shares.iter().map(|&share| scale.distance(share)));
             for (pair, (t, delta)) in edges[first..].windows(2).zip(&mut out) {
@@ -316,7 +322,7 @@ mod tests {
     #[test]
     fn proposal_samples_follow_histograms() {
         let config = ProposalConfig { uniform_share: 0.0, samples: 8, ..ProposalConfig::default() };
-        let sampler = Proposal { config, fields: vec![], trust: 1.0 };
+        let sampler = Proposal { config, spacing: Spacing::Linear, fields: vec![], trust: 1.0 };
         let shares = even_edges(10).repeat(2);
         let mut weights = vec![0.0; 20];
         (weights[3], weights[15]) = (0.5, 1.0);
@@ -335,8 +341,9 @@ mod tests {
 
     #[test]
     fn proposal_anneal_follows_schlick_bias() {
-        let config = ProposalConfig { anneal: 100, spacing: Spacing::Disparity, ..ProposalConfig::default() };
-        let mut sampler: Box<Proposal> = Box::new(Proposal { config, fields: vec![], trust: 0.0 });
+        let config = ProposalConfig { anneal: 100, early_stop_eps: 0.125, ..ProposalConfig::default() };
+        let mut sampler = Box::new(Proposal { config, spacing: Spacing::Disparity, fields: vec![], trust: 0.0 });
+        assert_eq!(Sampler::<f64>::early_stop_eps(&*sampler), 0.125);
         let mut at = |step: u64| {
             let progress = Progress { step, train_frac: 0.0, seed: 0 };
             Sampler::<f64>::update(&mut *sampler, &progress, &|_, _| {});
@@ -365,16 +372,38 @@ mod tests {
 
     #[test]
     fn spacings_range_from_near_to_far() {
+        let close = |a: f64, b: f64| (a - b).abs() <= 1e-9 * b;
         for spacing in [Spacing::Linear, Spacing::Disparity] {
-            let scale = Scale::new(spacing, [2.0, 10.0]);
-            assert!((scale.distance(0.0) - 2.0).abs() < 1e-12 && (scale.distance(1.0) - 10.0).abs() < 1e-12);
+            for [near, far] in [[2.0, 10.0], [0.0, 10.0], [0.2, 0.9], [0.05, 1e4], [3.0, 3000.0]] {
+                let scale = Scale::new(spacing, [near, far]);
+                assert!(
+                    close(scale.distance(0.0), near) && close(scale.distance(1.0), far),
+                    "{spacing:?} {near} {far}"
+                );
+            }
+            let nothing = Scale::new(spacing, [0.0, 0.0]);
+            assert_eq!([nothing.distance(0.0), nothing.distance(1.0)], [0.0; 2], "a ray without length");
         }
-        assert!((Scale::new(Spacing::Disparity, [2.0, 10.0]).distance(0.5) - 10.0 / 3.0).abs() < 1e-12);
-        let from_zero = Scale::new(Spacing::Disparity, [0.0, 10.0]);
-        assert!(
-            (from_zero.distance(0.0) - 0.01).abs() < 1e-12 && (from_zero.distance(0.5) - 0.02 / 1.001).abs() < 1e-12
-        );
-        let nothing = Scale::new(Spacing::Disparity, [0.0, 0.0]);
-        assert_eq!([nothing.distance(0.0), nothing.distance(1.0)], [0.0; 2], "a ray of no length");
+        assert!(close(Scale::new(Spacing::Disparity, [2.0, 10.0]).distance(0.5), 10.0 / 3.0));
+        // Half of the samples of an endless ray from the camera are within 1 unit, evenly.
+        let endless = Scale::new(Spacing::Disparity, [0.0, 1e12]);
+        for (share, distance) in [(0.25, 0.5), (0.5, 1.0), (0.75, 2.0), (0.875, 4.0)] {
+            assert!(close(endless.distance(share), distance), "{}", endless.distance(share));
+        }
+    }
+
+    #[test]
+    fn spacing_follows_the_scene_unless_it_is_set() {
+        let built = |unbounded: bool, spacing: Option<Spacing>| {
+            let config = ProposalConfig { spacing, ..ProposalConfig::default() };
+            let space = crate::Space { unbounded, ..crate::Space::within([glam::DVec3::NEG_ONE, glam::DVec3::ONE]) };
+            let params = &mut raygrad_nn::Params::<f32>::new();
+            let rng = &mut <rand_pcg::Pcg64Mcg as rand::SeedableRng>::seed_from_u64(0);
+            let sampler = config.build(BuildContext { space, frames: 0, params, name: "sampler", rng }).unwrap();
+            let sampler: Box<dyn std::any::Any> = sampler;
+            sampler.downcast::<Proposal>().unwrap().spacing
+        };
+        assert_eq!([false, true].map(|unbounded| built(unbounded, None)), [Spacing::Linear, Spacing::Disparity]);
+        assert_eq!(built(true, Some(Spacing::Linear)), Spacing::Linear);
     }
 }

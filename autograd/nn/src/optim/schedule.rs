@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Schedule {
-    /// A constant rate.
+    /// A constant learning rate.
     Constant {
         /// Learning rate. Range: 0 to 1e30.
         #[serde(alias = "rate")]
@@ -75,7 +75,7 @@ impl Schedule {
         let fraction = fraction.clamp(0.0, 1.0);
         let rise = |warmup: f64| if fraction < warmup { fraction / warmup } else { 1.0 };
         match *self {
-            Schedule::Constant { lr: rate } => rate,
+            Schedule::Constant { lr } => lr,
             Schedule::Linear { from, to, warmup } => rise(warmup) * (from + (to - from) * fraction),
             Schedule::Step { from, factor, every, warmup } => {
                 // A fraction such as 0.3 is a little less than three times 0.1.
@@ -99,7 +99,7 @@ impl Schedule {
         let check_warmup = |warmup| check("warmup", warmup, (0.0..=1.0).contains(&warmup), "0 to 1");
         let check_ratio = |name, rate| check(name, rate, rate > 0.0, "more than 0");
         match *self {
-            Schedule::Constant { lr: rate } => check_rate("rate", rate),
+            Schedule::Constant { lr } => check_rate("lr", lr),
             Schedule::Linear { from, to, warmup } | Schedule::Cosine { from, to, warmup } => {
                 check_rate("from", from)?;
                 check_rate("to", to)?;
