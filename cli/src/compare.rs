@@ -1,4 +1,4 @@
-//! `raygrad compare`: results of several runs side by side.
+//! `raygrad compare`: a table of the results of several runs.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use serde_json::Value;
 use super::output::{checksum, complain, entries, print};
 use super::run::Run;
 
-/// Conditions under which figures are figures of the same thing.
+/// Conditions that must be equal for comparable results.
 const SAME: [&str; 13] = [
     "scene",
     "split",
@@ -25,7 +25,7 @@ const SAME: [&str; 13] = [
     "quantisation",
     "images",
 ];
-/// What is measured; all else in a result is a condition.
+/// Measured fields. All other fields are conditions.
 const MEASURED: [&str; 7] = [
     "psnr_mean",
     "ssim_mean",
@@ -35,7 +35,7 @@ const MEASURED: [&str; 7] = [
     "color_per_pixel",
     "unskipped_per_pixel",
 ];
-/// Longest result that is read, in bytes.
+/// Largest result file, in bytes.
 const LONGEST: u64 = 1 << 28;
 
 /// Compare the results of several runs
@@ -58,7 +58,7 @@ pub struct Args {
 struct Row {
     run: String,
     name: String,
-    /// What was measured, and under which conditions.
+    /// Measured values and conditions.
     fields: BTreeMap<String, String>,
 }
 
@@ -68,7 +68,7 @@ pub fn run(args: &Args) -> Result<()> {
     for run in &args.runs {
         let opened = Run::open(run)?;
         let found = results(&opened.folder, args.only.as_deref())?;
-        // That of a run whose model is gone is what is left of it.
+        // The model file may be absent; results are not checked against it then.
         let model = checksum(&opened.model_file()).ok();
         if found.is_empty() {
             let what = match &args.only {
@@ -94,7 +94,7 @@ pub fn run(args: &Args) -> Result<()> {
     print(&table(&rows))
 }
 
-/// The files of results in a run's folder, by name.
+/// The result files in a run's folder, sorted by name.
 fn results(folder: &Path, only: Option<&str>) -> Result<Vec<PathBuf>> {
     let is_result = |path: &PathBuf| {
         let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
@@ -105,7 +105,7 @@ fn results(folder: &Path, only: Option<&str>) -> Result<Vec<PathBuf>> {
     Ok(entries(folder)?.into_iter().filter(is_result).collect())
 }
 
-/// The fields of a result under dotted names, and in place of the views their names.
+/// The fields of a result under dotted names. The views are replaced by their names.
 fn read(path: &Path) -> Result<BTreeMap<String, String>> {
     let bad = |what: String| Error::file(path, what);
     let length = std::fs::metadata(path).map_err(|e| bad(format!("cannot be read: {e}")))?.len();
@@ -132,7 +132,7 @@ fn read(path: &Path) -> Result<BTreeMap<String, String>> {
     Ok(fields)
 }
 
-/// Adds a value under its name, and those inside of it under dotted names.
+/// Adds a value under its name, and nested values under dotted names.
 fn flatten(name: String, value: Value, fields: &mut BTreeMap<String, String>) {
     match value {
         Value::Object(inner) => {
@@ -142,12 +142,12 @@ fn flatten(name: String, value: Value, fields: &mut BTreeMap<String, String>) {
     }
 }
 
-/// A value as users read it: a string without its quotes.
+/// A value for display: strings without quotes.
 fn shown(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
-/// The rows with a column for each differing condition; below them the common conditions.
+/// The rows with a column for each differing condition, and the common conditions below.
 fn table(rows: &[Row]) -> String {
     let mut conditions: Vec<&str> = rows.iter().flat_map(|row| row.fields.keys().map(String::as_str)).collect();
     conditions.sort_unstable();
@@ -163,7 +163,7 @@ fn table(rows: &[Row]) -> String {
     };
     let weights: Vec<&String> = rows.iter().filter_map(|row| row.fields.get("lpips_crc32")).collect();
     let figures = [("PSNR", "psnr_mean", 2), ("SSIM", "ssim_mean", 4), ("LPIPS", "lpips_mean", 4)];
-    // Where LPIPS was asked for nowhere, there is no column of it.
+    // Without LPIPS results, the column is omitted.
     let figures = figures.into_iter().filter(|(head, ..)| *head != "LPIPS" || !weights.is_empty());
     let figures: Vec<_> = figures.chain([("s/view", "seconds_per_view", 3)]).collect();
     let heads =
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_result_is_an_error_that_names_it() {
+    fn read_invalid_result_names_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("eval-test.json");
         for (text, expected) in [

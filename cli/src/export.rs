@@ -1,4 +1,4 @@
-//! `raygrad export`: what a run has found out, for other programs.
+//! `raygrad export`: cameras, datasets, geometry and scene pages for other programs.
 
 mod geometry;
 mod page;
@@ -65,7 +65,7 @@ pub struct Args {
     shape: geometry::GeometryOptions,
 }
 
-/// What is written, by the ending of the file's name.
+/// Kind of the output, from the file name's extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Cameras,
@@ -90,7 +90,7 @@ impl Kind {
     }
 }
 
-/// Writes the cameras, or the shape.
+/// Runs the export.
 pub fn run(args: &Args) -> Work<()> {
     let run = Run::open(&args.run)?;
     let kind = if args.to.is_some() { Kind::Cameras } else { Kind::of(&args.out)? };
@@ -125,10 +125,10 @@ pub fn run(args: &Args) -> Work<()> {
     Ok(())
 }
 
-/// Puts the cameras of the photographs that the model was trained on where it has found them to be; says how many those are.
+/// Sets the cameras of the capture to those with pose refinement. Returns the number of training images.
 ///
-/// What cameras have done as a whole is undone, which no photograph shows: so those of other photographs, and points, stay
-/// where they belong.
+/// The learned transform of all cameras is undone, since images do not determine it. So other cameras and the points
+/// keep their coordinates.
 fn refine(capture: &mut Capture, model: &Model<f32>, run: &Run) -> Result<usize> {
     let Some(refine) = &model.camera_optimizer else { return Ok(0) };
     let drift = refine.transform(&model.params).unwrap_or_default();
@@ -150,19 +150,19 @@ fn refine(capture: &mut Capture, model: &Model<f32>, run: &Run) -> Result<usize>
     Ok(trained.len())
 }
 
-/// Writes the cameras alone.
+/// Writes the cameras only.
 fn write(mut capture: Capture, out: &Path, job: &Job) -> Result<()> {
-    // Points would be a file of their own.
+    // Points would need a file of their own.
     capture.points.clear();
     for view in capture.views.iter_mut().filter(|view| view.image.is_some()) {
-        // As masks and depths are: from the folder of the capture.
+        // Paths start at the capture's folder, as those of masks and depths do.
         view.name = relative(&capture.folder, view)?;
     }
     let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
     let folder = tempfile::tempdir_in(parent(out)).map_err(bad)?;
     transforms::write(&capture, folder.path())?;
     let text = std::fs::read_to_string(folder.path().join("transforms.json")).map_err(bad)?;
-    // Beside what the format has; programs pass over fields that they do not know.
+    // An extra field for the mark. Other programs ignore unknown fields.
     let text = text.replacen('{', &format!("{{\n  \"exported_by\": \"{}\",", job.mark()), 1);
     job.check(out)?;
     write_atomic(out, text.as_bytes())

@@ -1,4 +1,4 @@
-//! `raygrad render`: new views.
+//! `raygrad render`: renders new views.
 
 mod animation;
 mod camera_motion;
@@ -106,7 +106,7 @@ pub struct Args {
 }
 
 impl Args {
-    /// One picture of a run, `picture.png` in its folder.
+    /// Arguments for one image of a run, `picture.png` in its folder.
     pub fn picture(run: &Path) -> Self {
         Args {
             run: run.into(),
@@ -125,7 +125,7 @@ impl Args {
         }
     }
 
-    /// What the output is, if the flags fit it.
+    /// The kind of the output; fails if an option does not apply to it.
     fn kind(&self, out: &Path) -> Result<Kind> {
         let kind = Kind::of(out)?;
         let unfit = |flag: &str, what: &str| Err(Error::setting(flag, what));
@@ -146,7 +146,7 @@ impl Args {
         Ok(kind)
     }
 
-    /// What decides what the output shows, but for the model.
+    /// The job of the output: all arguments that affect it, except for the model.
     fn job(&self, run: &Run) -> Job {
         let Args { flight, show, save, depth_unit, background, skip, precision, .. } = self;
         let arguments = json!({
@@ -159,7 +159,7 @@ impl Args {
             "skip": skip.map(|skip| skip.to_string()),
             "precision": precision,
         });
-        // Without --out, pictures go to a folder of the run's own.
+        // Without --out, renders go to a folder of the run, which no one else writes to.
         Job::new("render", &arguments, self.overwrite || self.out.is_none())
     }
 }
@@ -174,7 +174,8 @@ pub fn run(args: &Args) -> Work<()> {
     if kind != Kind::Folder {
         job.check(&out)?;
     }
-    // Before it is read: should it be replaced meanwhile, frames of both are never taken for one video.
+    // The checksums are computed before the files are read. If a file is replaced meanwhile, frames of both models
+    // never mix in one video.
     let stored = [checksum(&run.model_file())?, checksum(&run.file("config.json"))?];
     let mut model = run.model()?;
     if let Some(skip) = args.skip {
@@ -227,7 +228,7 @@ pub fn run(args: &Args) -> Work<()> {
             frames.keep();
             let older = other_numbered(&out, DIGITS, &(0..cameras.len()).collect::<Vec<_>>());
             if !older.is_empty() {
-                // They may be what somebody wants to keep.
+                // They may be files that users want to keep.
                 note(&format!("{} also holds {} numbered images of a longer path", out.display(), older.len()));
             }
         }
@@ -235,7 +236,7 @@ pub fn run(args: &Args) -> Work<()> {
     Ok(report(&cameras, &out)?)
 }
 
-/// The ending of videos where nobody says one: what plays everywhere, or else what needs no other program.
+/// The default video extension: MP4, which plays everywhere, or else GIF, which needs no other program.
 pub fn video_ending() -> &'static str {
     match VideoFormat::Mp4.check_encoder(Path::new("FILE.mp4")) {
         Ok(()) => "mp4",
@@ -243,10 +244,10 @@ pub fn video_ending() -> &'static str {
     }
 }
 
-/// The usual step of depths in files.
+/// Default step of 16-bit depths.
 const MILLI: f64 = 1e-3;
 
-/// Renders the frames that are not there yet.
+/// Renders the missing frames.
 fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Work<()> {
     let (start, first, all) = (Instant::now(), frames.done(), cameras.len());
     if first > 0 {
@@ -280,7 +281,7 @@ fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Work<()
     Ok(())
 }
 
-/// The seconds that are left if it took so many from the `first` frame to here.
+/// Estimated remaining seconds. `seconds` is the time since the `first` rendered frame.
 fn time_left(seconds: f64, [first, done, all]: [usize; 3]) -> f64 {
     seconds * (all - done) as f64 / (done - first) as f64
 }
@@ -291,7 +292,7 @@ fn report(cameras: &[Camera], out: &Path) -> Result<()> {
     print(&format!("rendered {} {frames} of {width}x{height}: {}\n", cameras.len(), out.display()))
 }
 
-/// All that decides what frames show, the checksums of model and configuration among it.
+/// All inputs of the frames, including the checksums of model and configuration.
 fn contents(args: &Args, [model, config]: [String; 2], cameras: &[Camera], shown: &Shown<'_>) -> Result<Value> {
     let flown = serde_json::to_vec(cameras).map_err(|e| Error::setting("path", e))?;
     Ok(json!({
@@ -310,7 +311,7 @@ fn contents(args: &Args, [model, config]: [String; 2], cameras: &[Camera], shown
     }))
 }
 
-/// What the output is.
+/// Kind of the output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     /// A folder of PNG files.
@@ -320,7 +321,7 @@ enum Kind {
 }
 
 impl Kind {
-    /// By the ending of a name.
+    /// The kind of a file extension.
     fn of(out: &Path) -> Result<Self> {
         if is_named_as_folder(out) {
             return Ok(Kind::Folder);
@@ -340,7 +341,7 @@ impl Kind {
     }
 }
 
-/// Whether a path ends as those of folders do.
+/// Returns true if a path ends with a separator.
 fn is_named_as_folder(out: &Path) -> bool {
     out.as_os_str().to_string_lossy().ends_with(std::path::is_separator)
 }
@@ -350,7 +351,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn endings_that_are_not_known_are_refused() {
+    fn kind_of_unknown_extension_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let dotted = folder.path().join("orbit.2");
         let of = |name: &str| Kind::of(&folder.path().join(name));
@@ -374,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_there_before_took_no_time() {
+    fn time_left_excludes_resumed_frames() {
         assert_eq!(time_left(6.0, [20, 22, 100]), 234.0);
         assert_eq!(time_left(6.0, [0, 3, 3]), 0.0);
     }

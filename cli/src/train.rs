@@ -31,14 +31,14 @@ use config::set_near;
 #[cfg(test)]
 pub use config::changed;
 
-/// Bytes of photographs that many a computer has not, where it does not say how many it has.
+/// Assumed free memory in bytes if the system does not report it.
 const HEAVY: f64 = 4e9;
-/// How often a run that has diverged goes back to its last checkpoint.
+/// Most returns of a diverged run to a checkpoint.
 const RETREATS: u32 = 3;
-/// What is said of a run that has nothing left to do.
+/// End of the message for a run that has used up its budget.
 const FINISHED: &str = ", the end of its budget: add --steps or --budget with a larger total to train on";
 
-/// Flags of new runs only.
+/// Options of new runs only.
 const NEW: [&str; 15] = [
     "scene",
     "preset",
@@ -194,24 +194,24 @@ pub struct Args {
 }
 
 impl Default for Args {
-    /// What `raygrad train` means without arguments.
+    /// The default arguments of `raygrad train`.
     fn default() -> Self {
         Args::parse_from(["train"])
     }
 }
 
-/// A run that was trained.
+/// A trained run.
 pub struct Trained {
     /// Its folder.
     pub folder: PathBuf,
-    /// Whether Ctrl-C ended it.
+    /// True if Ctrl-C ended it.
     pub interrupted: bool,
-    /// Whether its numbers are no longer finite.
+    /// True if its numbers are no longer finite.
     pub diverged: bool,
 }
 
 impl Trained {
-    /// With which code the program should exit.
+    /// The exit code of the program.
     pub fn exit_code(&self) -> ExitCode {
         match self {
             Trained { interrupted: true, .. } => interrupt::EXIT_CODE.into(),
@@ -221,12 +221,12 @@ impl Trained {
     }
 }
 
-/// Trains and leaves the model in a new folder, or goes on with a run.
+/// Trains a new run or resumes one.
 pub fn run(args: &Args) -> Result<Trained> {
     if !args.view && args.place.are_given() {
         return Err(Error::setting("view", "is missing: --host and --port need --view"));
     }
-    // Before anything is made that would have to go again.
+    // Binds the port first, before files are created.
     let listener = args.view.then(|| args.place.listen()).transpose()?;
     match &args.resume {
         None => begin(args, listener),
@@ -250,14 +250,14 @@ fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
     let trainer = Trainer::new(config, data.clone())?;
     let (run, lock) = Run::create(folder, args.run_config(&trainer, &data)?)?;
     describe(&run, &trainer, &data, &scene)?;
-    // Once nothing else can be wrong: an error is then the one line that is said.
+    // Warnings come after all checks, so that an error is the only line of output.
     doctor::warn(&scene);
 
     let preview = Preview::choose(&scene, args.downscale, &data, background);
     train((run, lock), trainer, args.budget(), args, preview, listener)
 }
 
-/// Goes on with a run from its last checkpoint.
+/// Resumes a run from its last checkpoint.
 fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trained> {
     let mut run = Run::open(folder)?;
     let RunConfig { scene_box: extent, downscale, config, .. } = run.config.clone();
@@ -297,7 +297,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     train((run, lock), trainer, budget, args, preview, listener)
 }
 
-/// Trains to the end of the budget, and leaves what came of it in the run's folder, which is locked.
+/// Trains to the end of the budget and writes the results to the run's folder, which is locked.
 fn train(
     (run, lock): (Run, Lock),
     mut trainer: Trainer,
@@ -340,9 +340,9 @@ fn train(
         (false, Some(_)) => Ended::Diverged,
         (false, None) => Ended::Done,
     };
-    // Whatever came of it, the run was good until then.
+    // A diverged run returns to its last checkpoint, which is good.
     let good = diverged.is_none() || watch.give_up(&mut trainer);
-    // From here on another program may resume it.
+    // The lock is released here, so that another program may resume the run.
     watch.finish(&trainer, ended, good)?;
     summarise(&run, &trainer.stats(), ended == Ended::Interrupted)?;
     if let Some(reason) = &diverged {
@@ -361,7 +361,7 @@ fn train(
     Ok(Trained { folder: run.folder, interrupted, diverged: diverged.is_some() })
 }
 
-/// Says what photographs will take if more is not free, or is not known to be, before they are read.
+/// Warns before loading if the images need more memory than is free.
 fn warn_of_memory(scene: &Opened, downscale: usize) {
     let Some((capture, _)) = &scene.capture else { return };
     let pixels: f64 = capture.present().map(|view| view.camera.width as f64 * view.camera.height as f64).sum();
@@ -380,7 +380,8 @@ fn warn_of_memory(scene: &Opened, downscale: usize) {
     }
 }
 
-/// What training will take, and a warning if so much is not free. What is there already is not taken again.
+/// Prints the estimated memory of training, and a warning if it is not free. Memory in use by this process is not
+/// counted twice.
 fn foresee_memory(trainer: &Trainer, data: &Dataset) -> Result<()> {
     let need = memory::need(trainer, data);
     let free = memory::available().map(|free| free + machine::taken_memory().unwrap_or(0) as f64);

@@ -1,4 +1,4 @@
-//! Cameras from above and from the side, as a picture.
+//! Drawing of the cameras from above and from the side.
 
 use glam::DVec3;
 use plotters::coord::Shift;
@@ -8,10 +8,10 @@ use raygrad::nerf::Image;
 use super::stage::{Pyramid, Stage};
 use crate::bench::bitmap;
 
-/// Width and height of one of the two views, and the height of the line above them.
+/// Width and height of each view, and height of the legend above them.
 const PANEL: i32 = 760;
 const HEAD: i32 = 44;
-/// Colours that colour-blind people tell apart (Okabe and Ito 2008).
+/// From the palette of Okabe and Ito (2008), which is safe for colour blindness.
 const TRAIN: RGBColor = RGBColor(0, 114, 178);
 const TEST: RGBColor = RGBColor(230, 159, 0);
 const ABSENT: RGBColor = RGBColor(190, 190, 190);
@@ -22,7 +22,7 @@ const FRAME: RGBColor = RGBColor(220, 220, 220);
 type Area<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
 type Drawn = Result<(), DrawingAreaErrorKind<<BitMapBackend<'static> as DrawingBackend>::ErrorType>>;
 
-/// The picture, or what went wrong.
+/// Draws the cameras; returns the message of an error.
 pub fn draw(stage: &Stage) -> Result<Image, String> {
     let size = (2 * PANEL as u32, (PANEL + HEAD) as u32);
     bitmap(size, |area| both(stage, area)).map_err(|e| e.to_string())
@@ -59,7 +59,7 @@ fn panel(stage: &Stage, area: &Area<'_>, left: i32, flat: fn(DVec3) -> [f64; 2])
     for [a, b] in edges(stage.bounds) {
         inner.draw(&PathElement::new([place(a), place(b)], style))?;
     }
-    // The middle of the scene.
+    // The centre of the scene.
     let middle = place(DVec3::ZERO);
     for [across, down] in [[6, 0], [0, 6]] {
         let ends = [(middle.0 - across, middle.1 - down), (middle.0 + across, middle.1 + down)];
@@ -81,7 +81,7 @@ fn panel(stage: &Stage, area: &Area<'_>, left: i32, flat: fn(DVec3) -> [f64; 2])
     Ok(())
 }
 
-/// The colour and the width of the lines of a camera.
+/// Colour and line width of a camera.
 fn look(camera: &Pyramid) -> (RGBColor, u32) {
     match (camera.flagged, camera.kind) {
         (true, _) => (FLAGGED, 2),

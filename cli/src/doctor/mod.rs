@@ -1,4 +1,4 @@
-//! `raygrad doctor`: whether a capture is good, and if not, what is wrong with it.
+//! `raygrad doctor`: checks a capture and explains its problems.
 
 mod drawing;
 mod page;
@@ -48,17 +48,17 @@ pub struct Args {
     pub json: bool,
 }
 
-/// Examines, writes the files and prints the result.
+/// Checks the capture, writes the files and prints the report.
 pub fn run(args: &Args) -> Result<ExitCode> {
     let Scene::Folder(folder) = &args.scene else {
         return Err(Error::setting("scene", "built-in scenes have no files to check: name a folder"));
     };
-    // Its folder has one name for all captures: each examination replaces the last.
+    // The job has no arguments, so that each check may replace the files of the last one.
     let job = Job::new("doctor", &Value::Null, args.overwrite);
     let files = ["cameras.png", "doctor.html"].map(|name| args.out.join(name));
     files.iter().try_for_each(|file| job.check(file))?;
     let capture = Capture::read(folder)?;
-    // A capture that has no size has none: the examination says why.
+    // The analysis fails for a capture without extent; the report gives the reason.
     let survey = capture.analyze_scene(args.scene_type).ok();
     make_folder(&args.out)?;
     let progress = Progress::new();
@@ -85,12 +85,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     })
 }
 
-/// Says in a line each what is wrong with the cameras of a scene that is to be trained on; of absent images, only how many
-/// there are of those that nobody reads.
+/// Warns of problems with the cameras of a training scene, one line each.
 pub fn warn(scene: &Opened) {
     let Some((capture, survey)) = &scene.capture else { return };
     let Report { findings, .. } = examine_cameras(capture, Some(survey));
-    // Those that are read have been named.
+    // Loading warns of absent images itself.
     let said = |finding: &Finding| finding.kind == FindingKind::ImagesAbsent;
     for Finding { kind, severity, what, .. } in findings.iter().filter(|finding| !said(finding)) {
         if *severity > Severity::Note {

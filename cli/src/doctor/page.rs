@@ -1,4 +1,4 @@
-//! One page with facts, findings, photographs and cameras, that asks nothing of the network.
+//! The self-contained page of facts, findings, images and cameras.
 
 use std::collections::HashMap;
 
@@ -11,15 +11,15 @@ use super::stage::Stage;
 use super::table;
 use crate::html::{escaped, filled};
 
-/// The page, with places for what is particular.
+/// The template of the page.
 const PAGE: &str = include_str!("page.html");
-/// Photographs that are shown with a finding, and their longest side.
+/// Most images of a finding, and their longest side in pixels.
 const SHOWN: usize = 8;
 const SIDE: usize = 180;
-/// Names that are listed with a finding.
+/// Most names of a finding.
 const NAMES: usize = 60;
 
-/// The text of the page. `mark` says what wrote it.
+/// The text of the page. `mark` identifies the job that wrote it.
 pub fn page(capture: &Capture, report: &Report, stage: &Stage, mark: &str) -> Result<String> {
     let rows = table::facts(&report.facts);
     let facts: String =
@@ -30,7 +30,7 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage, mark: &str) -> Re
         findings = "<p class=\"good\">No problems found.</p>".to_owned();
     }
     let data = serde_json::to_string(stage).map_err(|e| Error::setting("page", e))?;
-    // Within a script nothing may look like its end.
+    // The data must not end the script element.
     let data = data.replace("</", "<\\/");
     let title = escaped(&report.facts.folder.display().to_string());
     let texts =
@@ -38,7 +38,7 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage, mark: &str) -> Re
     Ok(filled(PAGE, &texts))
 }
 
-/// A finding, with some of the photographs that it names.
+/// A finding with some of its images.
 fn section(photographs: &HashMap<&str, &View>, finding: &Finding) -> String {
     let Finding { kind, severity, what, advice, views } = finding;
     let mut text = format!(
@@ -59,7 +59,7 @@ fn section(photographs: &HashMap<&str, &View>, finding: &Finding) -> String {
     text + &figures.collect::<String>() + "</section>\n"
 }
 
-/// A photograph as a small PNG; `None` if it cannot be read, which a finding says.
+/// An image as a small PNG; `None` if it cannot be read, which has its own finding.
 fn thumbnail(view: &View) -> Option<String> {
     let photo = Photo::open(view.image.as_ref()?, None).ok()?;
     let share = (SIDE as f64 / photo.width.max(photo.height) as f64).min(1.0);
@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scene_page_is_complete_and_offline() {
+    fn page_is_complete_and_offline() {
         let names = ["title", "facts", "findings", "stage", "mark"];
         let page = filled(PAGE, &names.map(|name| (name, format!("<{{{{{name}}}}}>"))));
         assert!(names.iter().all(|name| page.contains(&format!("<{{{{{name}}}}}>"))), "{page}");

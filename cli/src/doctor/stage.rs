@@ -1,4 +1,4 @@
-//! What is drawn of a capture: cameras, points and the box, in scene units with z up.
+//! Geometry of the drawing: cameras, points and the scene box, in scene units with z up.
 
 use std::collections::HashSet;
 
@@ -7,45 +7,45 @@ use raygrad::nerf::dataset::{Capture, SceneAnalysis, SceneTransform, SceneType, 
 use raygrad::nerf::doctor::{Report, Severity};
 use serde::Serialize;
 
-/// Points that are drawn at most.
+/// Most points of a drawing.
 const POINTS: usize = 6000;
-/// The length of a drawn camera, as a share of the median distance of cameras from the middle.
+/// Length of a drawn camera, as a fraction of the median distance of cameras from the centre.
 const LENGTH: f64 = 0.1;
 
 /// A camera as a pyramid.
 #[derive(Serialize)]
 pub struct Pyramid {
-    /// The name of its photograph.
+    /// Name of its image.
     pub name: String,
     /// `train`, `test` (held out), or `absent`.
     pub kind: &'static str,
-    /// Whether a finding above a note names it.
+    /// True if a warning or an error names it.
     pub flagged: bool,
-    /// Where it stands.
+    /// Camera centre.
     pub eye: DVec3,
     /// The corners of its image: upper left, upper right, lower right, lower left.
     pub corners: [DVec3; 4],
 }
 
-/// Everything that is drawn.
+/// All objects of a drawing.
 #[derive(Serialize)]
 pub struct Stage {
     pub cameras: Vec<Pyramid>,
-    /// Places of points of the scene.
+    /// Positions of the points.
     pub points: Vec<DVec3>,
-    /// Their colours.
+    /// Colours of the points.
     pub colors: Vec<[u8; 3]>,
-    /// Lower and upper corner of the box.
+    /// Lower and upper corner of the scene box.
     pub bounds: [DVec3; 2],
-    /// Whether the scene ends there.
+    /// True for a bounded scene.
     pub bounded: bool,
-    /// The middle of what is drawn, and half of its width.
+    /// Centre and half width of the drawing.
     pub centre: DVec3,
     pub reach: f64,
 }
 
 impl Stage {
-    /// Of a capture; one that has no survey is drawn in its own coordinates.
+    /// The stage of a capture. Without an analysis, it uses the capture's coordinates.
     pub fn new(capture: &Capture, survey: Option<&SceneAnalysis>, report: &Report) -> Self {
         let placement = survey.map_or_else(SceneTransform::default, |survey| survey.transform);
         let flagged: HashSet<&String> = report
@@ -81,7 +81,7 @@ impl Stage {
         let bounds = survey.map_or([DVec3::splat(-0.5 * usual), DVec3::splat(0.5 * usual)], |survey| survey.bounds);
         let [mut low, mut high] = bounds;
         for camera in &cameras {
-            // One camera that is far away must not hide all others.
+            // Distant cameras are clamped, so that one outlier does not shrink all others.
             let eye = camera.eye.clamp(DVec3::splat(-5.0 * usual), DVec3::splat(5.0 * usual));
             (low, high) = (low.min(eye), high.max(eye));
         }

@@ -1,13 +1,13 @@
-//! Facts and findings as lines of text.
+//! Facts and findings as text.
 
 use raygrad::nerf::doctor::{CaptureSubset, Facts, Finding, Range, Report, Resolution, SceneLayout};
 
-/// Names of photographs that are printed with a finding; the page has all of them.
+/// Most image names per finding. The page shows more.
 const NAMES: usize = 6;
 /// Columns of a line of advice.
 const WIDTH: usize = 96;
 
-/// The facts, each with its name.
+/// Names and values of the facts.
 pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     let mut rows = vec![("format", facts.format.clone())];
     let parts = facts.subsets.iter().map(|CaptureSubset { split, present, absent }| match absent {
@@ -52,7 +52,7 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     rows
 }
 
-/// The names of photographs that a finding is about, as far as they are printed.
+/// The image names of a finding, up to `most`.
 pub fn names(finding: &Finding, most: usize) -> String {
     let mut text = joined(finding.views.iter().take(most).cloned());
     if finding.views.len() > most {
@@ -61,7 +61,7 @@ pub fn names(finding: &Finding, most: usize) -> String {
     text
 }
 
-/// Everything, for a terminal.
+/// The report for a terminal.
 pub fn text(report: &Report) -> String {
     let rows = facts(&report.facts);
     let width = rows.iter().map(|(name, _)| name.len()).max().unwrap_or(0);
@@ -89,7 +89,7 @@ fn range(Range { least, median, most }: Range) -> String {
     if most - least < 0.005 * median.abs() { format!("{median:.1}") } else { format!("{least:.1} to {most:.1}") }
 }
 
-/// Lines of at most [`WIDTH`] columns, indented.
+/// Wraps text to [`WIDTH`] columns, with indentation.
 fn wrapped(text: &str) -> String {
     let (mut out, mut line) = (String::new(), String::new());
     for word in text.split(' ') {

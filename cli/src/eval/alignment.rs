@@ -1,35 +1,35 @@
-//! What is not the model's fault: where the cameras of photographs are, and how these were exposed.
+//! Cameras and appearance of the evaluated views. Errors in them are not errors of the model.
 
 use raygrad::nerf::dataset::{Dataset, Split};
 use raygrad::nerf::{Error, InstantConfig, Model, Result};
 use serde::Serialize;
 
-/// From where views are rendered.
+/// Cameras of the evaluated views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum Alignment {
-    /// From where the scene has its cameras: the model has learned nothing of them.
+    /// The cameras of the scene; the model has no pose refinement.
     #[serde(rename = "none")]
     None,
-    /// From where the model has found the cameras of its photographs to be.
+    /// The refined cameras of the training images.
     #[serde(rename = "as learned")]
     Learned,
-    /// Focal length and lens are those that were found; poses are the scene's.
+    /// The poses of the scene with the refined focal length and lens.
     #[serde(rename = "focal length and lens as learned")]
     Glass,
-    /// As well, and poses moved by the similarity that takes the training cameras from where they were given to where they
-    /// were found.
+    /// As [`Glass`](Self::Glass), with poses mapped by the similarity between given and refined training cameras.
     #[serde(rename = "similarity of the training cameras")]
     Similarity,
-    /// From where the model shows each most nearly, found from where one of the above has them.
+    /// Each camera is fitted to the model, starting from one of the above.
     #[serde(rename = "each fitted to its own photograph")]
     Fitted,
 }
 
 impl Alignment {
-    /// Puts the cameras of the photographs where the model has them.
+    /// Sets the cameras of the images.
     ///
     /// # Errors
-    /// If a photograph is said to be one of those that were trained on, whose names are `trained`, and is not.
+    ///
+    /// Fails if the split is the training split and an image is not in `trained`, the names of the training images.
     pub fn apply(model: &Model<f32>, trained: &[String], split: Split, data: &mut Dataset) -> Result<Self> {
         let Some(refine) = &model.camera_optimizer else { return Ok(Alignment::None) };
         if split == Split::Train {
@@ -56,25 +56,25 @@ impl Alignment {
     }
 }
 
-/// What is done about what photographs differ in and nobody knows of one that was held out.
+/// Appearance of the evaluated views, as that of held-out images is unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum Appearance {
-    /// Nothing: the model takes all photographs to be alike.
+    /// The model has no appearance parameters.
     #[serde(rename = "none")]
     None,
-    /// Views have the mean of what was learned of the photographs that were trained on: of their codes, and of their exposures.
+    /// The mean over the training images of appearance embedding and exposure.
     #[serde(rename = "mean of the training photographs")]
     Mean,
-    /// Views have what was learned of the photograph itself: it was trained on.
+    /// The appearance of the image itself, for training images.
     #[serde(rename = "each photograph's own")]
     Own,
-    /// As the mean, and a gain for each channel makes the left half most like the photograph's; the right half is compared.
+    /// As [`Mean`](Self::Mean), with one gain per channel fitted to the left half. The right half is compared.
     #[serde(rename = "gains fitted to the left half, right half compared")]
     Half,
 }
 
 impl Appearance {
-    /// How many columns on the left of an image are not compared.
+    /// Number of left columns of an image that are excluded from the comparison.
     pub fn fitted_columns(self, width: usize) -> usize {
         if self == Appearance::Half { width / 2 } else { 0 }
     }

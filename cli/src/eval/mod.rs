@@ -1,4 +1,4 @@
-//! `raygrad eval`: how close a model comes to photographs.
+//! `raygrad eval`: compares renders with images.
 
 pub mod alignment;
 mod page;
@@ -28,11 +28,11 @@ use super::scene::{Opened, Scene};
 use alignment::{Alignment, Appearance};
 use report::{Identity, Perceived, Report, Score, table};
 
-/// Digits of the number of a picture.
+/// Digits of the number of an image file.
 const DIGITS: usize = 3;
-/// The folder in which pictures are until all are there.
+/// Folder of the image files until the evaluation is complete.
 const UNFINISHED: &str = "unfinished";
-/// The file by which an evaluation keeps others from writing there.
+/// Lock file of an evaluation.
 const LOCK: &str = "unfinished.lock";
 
 /// Measure PSNR, SSIM and LPIPS on held-out images
@@ -95,7 +95,7 @@ pub struct Args {
 }
 
 impl Args {
-    /// The name of the result: `eval`, the split, what is left out if there is a grid, and what differs from the ordinary.
+    /// Name of the result: `eval`, the split, skipping if there is a grid, and other options.
     fn name(&self, skip: Option<Skipping>, lpips: Option<Backbone>) -> String {
         let precision = (self.precision == Precision::F64).then(|| "f64".to_owned());
         let views = self.views.map(|n| n.to_string());
@@ -108,7 +108,7 @@ impl Args {
     }
 }
 
-/// What views leave out, in a word: `own` if the configuration says it number by number.
+/// Skipping in a word; `own` for custom thresholds.
 fn level(skip: Skipping) -> String {
     let is = |level: &Skip| {
         let Skipping { grid, carving, .. } = skip;
@@ -117,7 +117,7 @@ fn level(skip: Skipping) -> String {
     [Skip::Off, Skip::NearLossless, Skip::Fast].into_iter().find(is).map_or("own".to_owned(), |level| level.to_string())
 }
 
-/// Who says which photographs are held out.
+/// The rule that selects the held-out images.
 fn hold_out(opened: &Opened) -> &'static str {
     match &opened.capture {
         None => "built in",
@@ -126,10 +126,11 @@ fn hold_out(opened: &Opened) -> &'static str {
     }
 }
 
-/// Evaluates, writes the files and prints the result.
+/// Evaluates the model, writes the files and prints the result.
 pub fn run(args: &Args) -> Result<()> {
     let run = Run::open(&args.run)?;
-    // Before it is read: should it be replaced meanwhile, the result is not taken for that of the new one.
+    // The checksum is computed before the model is read. If the file is replaced meanwhile, the result does not name
+    // the new model.
     let crc32 = checksum(&run.model_file())?;
     let mut model = run.model()?;
     let identity = Identity::of(&run, &model, crc32);
@@ -154,7 +155,7 @@ pub fn run(args: &Args) -> Result<()> {
     if let Some(lpips) = &lpips {
         check_seen(lpips.backbone(), &data, appearance)?;
     }
-    // Corners are as dark in every photograph.
+    // Vignetting is the same in all images, so renders have it too.
     model.vignetted = true;
     let mut cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
     if args.fit_poses {
@@ -169,7 +170,7 @@ pub fn run(args: &Args) -> Result<()> {
     make_folder(&pictures)?;
     let busy = || Error::file(&pictures, "another raygrad is writing it: wait until it ends");
     let lock = Lock::take(&pictures.join(LOCK), busy)?;
-    // What an evaluation that was ended before has left there is begun again.
+    // Files of an interrupted evaluation are discarded.
     let unfinished = pictures.join(UNFINISHED);
     let _ = std::fs::remove_dir_all(&unfinished);
     make_folder(&unfinished)?;
@@ -224,7 +225,7 @@ pub fn run(args: &Args) -> Result<()> {
         let what = "was removed, or another raygrad evaluates there now: nothing was written; run the command again";
         return Err(Error::file(&pictures, what));
     }
-    // An evaluation that is ended before leaves the last one's result as it was.
+    // The result is replaced only after the evaluation is complete.
     write_json(&file, &report)?;
     for name in drawn.iter().map(|&i| numbered(i, DIGITS)) {
         let (from, to) = (unfinished.join(&name), pictures.join(&name));
@@ -232,7 +233,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let _ = std::fs::remove_dir(&unfinished);
     lock.remove();
-    // Pictures of an evaluation of other photographs under the same name would belong to no result.
+    // Renders of earlier evaluations with other views would belong to no result.
     remove(&other_numbered(&pictures, DIGITS, &drawn.iter().copied().collect::<Vec<_>>()));
     let index = pictures.join("index.html");
     write_atomic(&index, page::page(&report).as_bytes())?;
@@ -243,8 +244,8 @@ pub fn run(args: &Args) -> Result<()> {
     print(&format!("{}written: {}, {}\n", table(&report), file.display(), index.display()))
 }
 
-/// Whether the network sees something of all views that are compared whole, and there are any; a word about those that are not,
-/// and about its memory.
+/// Checks that unmasked images are large enough for the network, and that there is one. Notes masked images, and warns
+/// if memory is short.
 fn check_seen(backbone: Backbone, data: &Dataset, appearance: Appearance) -> Result<()> {
     let bad = |what: String| Err(Error::setting("lpips", what));
     let (side, mut largest, mut masked) = (backbone.smallest(), 0, 0);
@@ -274,7 +275,7 @@ fn check_seen(backbone: Backbone, data: &Dataset, appearance: Appearance) -> Res
     Ok(())
 }
 
-/// The background that images are compared over: a random one is for training only.
+/// The background of compared images. Random backgrounds are for training only.
 fn shown_background(trained: Background) -> Background {
     match trained {
         Background::Random => Background::White,
@@ -282,29 +283,28 @@ fn shown_background(trained: Background) -> Background {
     }
 }
 
-/// The mean, unless there is nothing or something is missing.
+/// The mean; `None` if there are no values or one is missing.
 fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
     let count = values.len();
     let sum: Option<f64> = values.sum();
     sum.filter(|_| count > 0).map(|sum| sum / count as f64)
 }
 
-/// Renders views and compares them with photographs.
+/// Renders views and compares them with images.
 struct Judge {
     renderer: Renderer,
     background: [f32; 3],
     span: [f64; 2],
     data: Dataset,
-    /// The number of the photograph that each view looks like, if it does.
+    /// The number of each view's training image, for its appearance.
     looks: Vec<Option<u32>>,
     appearance: Appearance,
-    /// Weights of LPIPS, if it is measured.
+    /// Weights of LPIPS, if enabled.
     lpips: Option<Lpips>,
 }
 
 impl Judge {
-    /// The scores of all views, of which some are drawn; the mean time of rendering one, in seconds; and what was evaluated
-    /// for all.
+    /// Renders and scores all views. Draws some of them. Returns scores, mean seconds per view, and total evaluations.
     fn all(&mut self, pictures: &Path) -> Result<(Vec<Score>, f64, Evaluations)> {
         let count = self.data.frames.len();
         let drawn = report::regular(count);
@@ -330,7 +330,7 @@ impl Judge {
         Ok((scores, seconds / count as f64, evaluations))
     }
 
-    /// Draws those of the views that [`all`](Self::all) has not.
+    /// Draws the views that [`all`](Self::all) has not drawn.
     fn draw_others(&mut self, views: &BTreeSet<usize>, pictures: &Path) -> Result<()> {
         for &i in views.difference(&report::regular(self.data.frames.len())) {
             let picture = self.render(i);
@@ -344,7 +344,7 @@ impl Judge {
         self.renderer.view(&self.data.frames[i].camera, self.background)
     }
 
-    /// A view beside its photograph, as they are compared.
+    /// A render and its image as they are compared.
     fn shown(&self, i: usize, mut picture: Render) -> Result<Shown> {
         let frame = &self.data.frames[i];
         let truth = frame.image.over(self.background);
@@ -362,21 +362,21 @@ impl Judge {
         Ok(Shown { picture, truth, half })
     }
 
-    /// Photograph, render, error and depth, side by side.
+    /// Image, render, error and depth, side by side.
     fn draw(&self, Shown { picture, truth, .. }: &Shown) -> Image {
         let error = colormap::error_map(&picture.color, truth);
         Image::hconcat(&[truth, &picture.color, &error, &depth_colors(picture, self.span)])
     }
 }
 
-/// A view and its photograph, of which the columns from `half` on are compared.
+/// A render and its image. Only the columns from `half` on are compared.
 struct Shown {
     picture: Render,
     truth: Image,
     half: usize,
 }
 
-/// The pixels of these columns of an image that are [used](Frame::mask), in a row.
+/// The [used](Frame::mask) pixels of these columns, in a row.
 fn used(frame: &Frame, image: &Image, columns: Range<usize>) -> Image {
     let places = (0..image.height).flat_map(|y| columns.clone().map(move |x| (x, y)));
     let used = places.filter(|(x, y)| frame.mask.as_ref().is_none_or(|mask| mask.uses(*x, *y)));
@@ -384,8 +384,8 @@ fn used(frame: &Frame, image: &Image, columns: Range<usize>) -> Image {
     Image { width: data.len() / 3, height: 1, channels: 3, data }
 }
 
-/// The factors of red, green and blue that make the columns before `half` of a render most like the photograph, in the sense of least
-/// squares; 1 where there is nothing to multiply.
+/// Least-squares gains of red, green and blue that map the columns before `half` of a render to the image. A black
+/// channel has gain 1.
 fn gains(frame: &Frame, render: &Image, truth: &Image, half: usize) -> [f32; 3] {
     let [render, truth] = [render, truth].map(|image| used(frame, image, 0..half));
     std::array::from_fn(|channel| {
@@ -400,7 +400,7 @@ fn scale(image: &mut Image, gains: [f32; 3]) {
     image.data.chunks_exact_mut(3).for_each(|pixel| pixel.iter_mut().zip(gains).for_each(|(x, gain)| *x *= gain));
 }
 
-/// Of the pixels from column `half` on that are used; where some are not, windows and networks see nothing to speak of.
+/// Scores the used pixels from column `half` on. SSIM and LPIPS need an image without a mask.
 fn score(frame: &Frame, render: &Image, truth: &Image, half: usize, lpips: Option<&Lpips>) -> Score {
     let [seen, shown] = [render, truth].map(|image| used(frame, image, half..image.width));
     let psnr = psnr(&seen, &shown);
@@ -426,7 +426,7 @@ mod tests {
     fn fit_half_gains_correct_exposure() {
         let mut frame = embedded(Split::Test, 26).frames.remove(0);
         let truth = frame.image.over([1.0; 3]);
-        // Too dark by a factor for each channel, but for one pixel on the right.
+        // Each channel is too dark by a factor, except for one pixel on the right.
         let mut render = truth.clone();
         scale(&mut render, [0.5, 0.8, 1.25]);
         let found = gains(&frame, &render, &truth, 13);
@@ -434,16 +434,16 @@ mod tests {
         scale(&mut render, found);
         assert!(score(&frame, &render, &truth, 13, None).psnr > 100.0);
         render.pixel_mut(20, 7)[1] += 0.5;
-        // A quarter, of 13 x 26 pixels of 3 channels; the similarity is that of the right half.
+        // The error is 0.25 over 13 x 26 pixels of 3 channels. SSIM is that of the right half.
         let off = score(&frame, &render, &truth, 13, None);
         assert!((off.psnr - 10.0 * (3.0 * 13.0 * 26.0 / 0.25_f64).log10()).abs() < 1e-3, "{}", off.psnr);
         assert!(off.ssim.unwrap() < 0.999 && score(&frame, &render, &truth, 0, None).psnr > off.psnr + 2.9);
-        // Structures are of windows of 11 x 11.
+        // SSIM windows have 11 x 11 pixels.
         let ssim = |half: usize| score(&frame, &render, &truth, half, None).ssim;
         assert!(ssim(15).is_some() && ssim(16).is_none());
         render.pixel_mut(3, 7)[1] = 9.0;
         assert_eq!(score(&frame, &render, &truth, 13, None).psnr, off.psnr, "what was fitted to is not compared");
-        // Pixels that are not used neither fit nor count; a render of nothing has no gain.
+        // Masked pixels are excluded from fit and score. A black render has gain 1.
         let mask = Mask::new(26, 26, |x, y| y != 7 || (x != 3 && x != 20));
         frame.mask = Some(Arc::new(mask));
         let masked = score(&frame, &render, &truth, 13, None);
@@ -453,7 +453,7 @@ mod tests {
     }
 
     #[test]
-    fn lpips_is_refused_where_it_would_see_nothing() {
+    fn check_seen_small_or_masked_images_fail() {
         let mut data = embedded(Split::Test, 26);
         data.frames.truncate(2);
         let check =
@@ -464,7 +464,7 @@ mod tests {
                 .unwrap_err()
                 .contains("has 13x26 pixels to compare; vgg needs at least 16x16")
         );
-        // Too low, in a photograph that counts.
+        // An image without a mask that is not high enough.
         let low = data.frames[0].image.clone();
         data.frames[1].image = Image::new(40, 15, 3).into();
         assert!(check(&data, Appearance::None).unwrap_err().contains("40x15"));

@@ -1,4 +1,4 @@
-//! A result as a page to look at, with its pictures beside it.
+//! The HTML page of a result, with its images in a folder.
 
 use serde_json::Value;
 
@@ -6,10 +6,10 @@ use super::report::{Report, Score, four_digits};
 use super::{DIGITS, numbered};
 use crate::html::{escaped, filled};
 
-/// The page, with places for what is particular.
+/// The template of the page.
 const PAGE: &str = include_str!("page.html");
 
-/// The text of the page: the drawn views, the worst first; a table of all views; the settings, folded.
+/// The text of the page: drawn views, worst first, a table of all views, and the collapsed settings.
 pub fn page(report: &Report) -> String {
     let order = report.by_psnr();
     let drawn = report.drawn();
@@ -37,9 +37,9 @@ pub fn page(report: &Report) -> String {
     )
 }
 
-/// All fields of the report but those of single views, as rows of a table.
+/// All fields of the report except for the views, as table rows.
 fn facts(report: &Report) -> String {
-    // A report is made of what JSON knows.
+    // A report always converts to JSON.
     let Ok(Value::Object(all)) = serde_json::to_value(report) else { return String::new() };
     let rows = all.iter().filter(|(name, _)| *name != "per_view").flat_map(|(name, value)| match value {
         Value::Object(inner) if name == "model" => inner.iter().map(|(own, v)| (format!("{name} {own}"), v)).collect(),

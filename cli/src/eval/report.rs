@@ -1,4 +1,4 @@
-//! What an evaluation has found, and all that it depends on.
+//! Results and conditions of an evaluation.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -14,94 +14,94 @@ use crate::precision::Precision;
 use crate::run::{Run, RunConfig};
 use crate::scene::Scene;
 
-/// Views of which a picture is written beside those of the worst ones.
+/// Number of evenly spaced views that are drawn, in addition to the worst ones.
 const PICTURES: usize = 10;
-/// Views that are shown as the worst.
+/// Number of worst views that are drawn.
 const WORST: usize = 3;
 
-/// The result: `eval-SPLIT-SKIP.json`. All but what was measured is what the figures depend on.
+/// The result: `eval-SPLIT-SKIP.json`, with measured values and all conditions.
 #[derive(Serialize)]
 pub struct Report {
-    /// The version that evaluates.
+    /// Version of raygrad for the evaluation.
     pub raygrad: &'static str,
     pub scene: Scene,
     pub split: Split,
-    /// Who says which photographs are held out.
+    /// The rule that selects the held-out images.
     pub hold_out: &'static str,
     /// Number of views.
     pub views: usize,
     pub width: usize,
     pub height: usize,
     pub downscale: usize,
-    /// What photographs with transparency are composited over.
+    /// Background of transparent images.
     pub background: Background,
-    /// What was left out; null where there is no occupancy grid.
+    /// Skipping; null without an occupancy grid.
     pub skip: Option<Skipping>,
-    /// `f32`, or `f64` with nothing left out but empty cells.
+    /// `f32`, or `f64` that skips empty cells only.
     pub precision: Precision,
-    /// Where the cameras are: as the scene has them, or as the model has found out.
+    /// Cameras of the views.
     pub cameras: Alignment,
-    /// As what photograph's exposure and code views are rendered.
+    /// Appearance of the views: exposure and appearance embedding.
     pub appearance: Appearance,
-    /// Where in a pixel its ray passes: 0.5 is the centre.
+    /// Position of the ray in a pixel: 0.5 is the centre.
     pub pixel_offset: f64,
     /// `none`: floating-point renders, clamped to 0..=1, are compared.
     pub quantisation: &'static str,
     pub model: Identity,
     pub threads: usize,
     pub processor: String,
-    /// The mean of the views' PSNR in dB; `inf` or `NaN` in words.
+    /// Mean PSNR in dB; `inf` and `NaN` as strings.
     #[serde(serialize_with = "number")]
     pub psnr_mean: f64,
-    /// The mean of the views' SSIM; null if the images are smaller than its window.
+    /// Mean SSIM; null if the images are smaller than its window.
     #[serde(serialize_with = "some")]
     pub ssim_mean: Option<f64>,
     #[serde(flatten)]
     pub lpips: Option<Perceived>,
-    /// Mean rendering time of a view.
+    /// Mean render time of a view, in seconds.
     pub seconds_per_view: f64,
-    /// Evaluations of densities and of colours for each pixel, and of both if nothing in the box were skipped.
+    /// Density and colour evaluations per pixel, and the number of each without skipping within the box.
     pub density_per_pixel: f64,
     pub color_per_pixel: f64,
     pub unskipped_per_pixel: f64,
     pub per_view: Vec<Score>,
 }
 
-/// LPIPS, where it was asked for, and what it depends on.
+/// LPIPS and its conditions, if enabled.
 #[derive(Serialize)]
 pub struct Perceived {
-    /// The mean of the views' LPIPS; null if some are masked.
+    /// Mean LPIPS; null if an image is masked.
     #[serde(serialize_with = "some")]
     pub lpips_mean: Option<f64>,
-    /// The network whose features are compared.
+    /// Network of the features.
     pub lpips_backbone: Backbone,
-    /// CRC-32 of the file of its weights.
+    /// CRC-32 of the weights file.
     pub lpips_crc32: String,
 }
 
-/// Which model it is, and how it came to be.
+/// Identifies the model and its training.
 #[derive(Serialize)]
 pub struct Identity {
-    /// CRC-32 of its file.
+    /// CRC-32 of the model file.
     pub crc32: String,
     pub parameters: usize,
-    /// Kinds of the field and of what samples it.
+    /// Kinds of the field and of the sampler.
     pub field: String,
     pub sampler: String,
-    /// The version that trained it.
+    /// Version of raygrad for the training.
     pub raygrad: String,
-    /// Photographs that it was trained on.
+    /// Number of training images.
     pub photographs: usize,
     pub seed: u64,
-    /// How long it was to be trained.
+    /// Training budget.
     pub budget: Option<Budget>,
-    /// How long it was, as far as `metrics.jsonl` has it: steps, and seconds of training.
+    /// Training steps and seconds, from the last line of `metrics.jsonl`.
     pub steps: Option<u64>,
     pub train_seconds: Option<f64>,
 }
 
 impl Identity {
-    /// That of the model in a run's file, which has this checksum.
+    /// The identity of the model in a run's file with this checksum.
     pub fn of(run: &Run, model: &Model<f32>, crc32: String) -> Self {
         let metrics = std::fs::read_to_string(run.file("metrics.jsonl")).unwrap_or_default();
         let last = metrics.lines().rev().find_map(|line| serde_json::from_str::<StepStats>(line).ok());
@@ -121,25 +121,25 @@ impl Identity {
     }
 }
 
-/// The numbers of some views that are evenly spaced.
+/// The indices of evenly spaced views.
 pub fn regular(views: usize) -> BTreeSet<usize> {
     evenly_spaced((0..views).collect(), PICTURES).into_iter().collect()
 }
 
 impl Report {
-    /// The numbers of the views of which pictures are written: some that are evenly spaced, and the worst.
+    /// The indices of the drawn views: evenly spaced ones, and the worst.
     pub fn drawn(&self) -> BTreeSet<usize> {
         regular(self.views).into_iter().chain(self.worst()).collect()
     }
 
-    /// The numbers of the worst views, the worst first.
+    /// The indices of the worst views, worst first.
     pub fn worst(&self) -> Vec<usize> {
         let mut order = self.by_psnr();
         order.truncate(WORST);
         order
     }
 
-    /// The numbers of all views, that of the lowest PSNR first; what is no number is lower still.
+    /// The indices of all views, sorted by PSNR. NaN comes first.
     pub fn by_psnr(&self) -> Vec<usize> {
         let mut order: Vec<usize> = (0..self.per_view.len()).collect();
         let psnr = |i: &usize| self.per_view[*i].psnr;
@@ -148,7 +148,7 @@ impl Report {
     }
 }
 
-/// The result for one view.
+/// Scores of one view.
 #[derive(Serialize)]
 pub struct Score {
     pub name: String,
@@ -160,7 +160,7 @@ pub struct Score {
     pub lpips: Option<f64>,
 }
 
-/// The same of one that there may not be.
+/// Serialises an optional number as [`number`] does.
 fn some<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
     match value {
         Some(value) => number(value, serializer),
@@ -168,7 +168,7 @@ fn some<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::E
     }
 }
 
-/// A number as JSON has it, or in words what it has no number for.
+/// Serialises a number. Values that JSON lacks become strings.
 fn number<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
     if value.is_finite() { serializer.serialize_f64(*value) } else { serializer.collect_str(value) }
 }
@@ -179,7 +179,7 @@ impl fmt::Display for Score {
     }
 }
 
-/// SSIM or LPIPS, where there is one.
+/// SSIM or LPIPS with four digits, if available.
 pub fn four_digits(value: Option<f64>) -> String {
     value.map_or("-".to_owned(), |value| format!("{value:.4}"))
 }
@@ -232,7 +232,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_json_has_no_number_for_is_said_in_words() {
+    fn non_finite_numbers_serialise_as_strings() {
         let of =
             |psnr: f64, ssim, lpips| serde_json::to_string(&Score { name: "a".into(), psnr, ssim, lpips }).unwrap();
         for (psnr, expected) in [(31.5, "31.5"), (f64::INFINITY, "\"inf\""), (f64::NAN, "\"NaN\"")] {

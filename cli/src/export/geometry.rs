@@ -19,15 +19,15 @@ use crate::progress::{Progress, spoken};
 use crate::run::Run;
 use crate::scene::Scene;
 
-/// Cameras in each of the rings that look at the scene.
+/// Cameras per ring around the scene.
 const RING: usize = 12;
-/// Photographs whose cameras look at the scene too, at most.
+/// Most training cameras that are used.
 const PHOTOGRAPHS: usize = 100;
 
 /// Most points of a cloud.
 const MOST_POINTS: usize = 10_000_000;
 
-/// What is made of a model's shape.
+/// Options of meshes and point clouds.
 #[derive(clap::Args, Serialize)]
 pub struct GeometryOptions {
     /// Write at most N points instead of a mesh
@@ -73,7 +73,7 @@ pub struct GeometryOptions {
 }
 
 impl GeometryOptions {
-    /// Whether nothing of this is asked for, which cameras have no use for.
+    /// Fails if one of the options is set, as they do not apply to cameras.
     pub fn check_absent(&self) -> Result<()> {
         let given = [
             ("points", self.points.is_some()),
@@ -93,7 +93,7 @@ impl GeometryOptions {
     }
 }
 
-/// Makes the shape and writes it.
+/// Extracts and writes the geometry.
 pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Path, job: &Job) -> Result<()> {
     check_writable(parent(out))?;
     let model = run.model()?;
@@ -149,7 +149,7 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Pa
     print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
 }
 
-/// Cameras that look at the scene: those of its photographs, if they are still there or `scene` says where, and others around it.
+/// Rings of cameras around the scene, and the training cameras. Their absence is an error only if `scene` is given.
 fn cameras(run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<Vec<Camera>> {
     let around = rings(&run.config.viewpoint, &run.config.scene_box);
     let own = match photographs(run, model, scene, Split::Train) {
@@ -163,14 +163,14 @@ fn cameras(run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<Vec<C
     Ok(own.into_iter().map(|photograph| photograph.camera).chain(around).collect())
 }
 
-/// Cameras around the scene, at the mean height of its photographs, lower, and higher.
+/// Rings of cameras around the scene at the mean elevation of the images, below and above.
 fn rings(viewpoint: &Viewpoint, extent: &SceneBox) -> Vec<Camera> {
     let mean = viewpoint.elevation;
     let elevations = [0.1 * mean, 0.5 * mean, mean, 0.5 * (mean + FRAC_PI_2.copysign(mean))];
     let ring = |elevation| Viewpoint { elevation, ..*viewpoint }.orbit(extent, RING);
     let mut around: Vec<Camera> = vec![];
     for camera in elevations.into_iter().flat_map(ring) {
-        // What swings to and fro comes by places twice, and rings at the horizon are one.
+        // A swinging orbit visits positions twice, and rings at the horizon coincide.
         if !around.iter().any(|other| other.pose.abs_diff_eq(camera.pose, 1e-9)) {
             around.push(camera);
         }
@@ -178,7 +178,7 @@ fn rings(viewpoint: &Viewpoint, extent: &SceneBox) -> Vec<Camera> {
     around
 }
 
-/// How far each stage is, and how long it may take.
+/// Progress of the stages.
 struct Display {
     progress: Progress,
     stage: Option<(Stage, Instant)>,
@@ -213,22 +213,23 @@ mod tests {
     use std::f64::consts::PI;
 
     #[test]
-    fn no_camera_around_a_scene_is_there_twice() {
+    fn rings_have_no_duplicate_cameras() {
         let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::new(1.0, 2.0, 1.0)], [0.5, 9.0]);
         let around = |elevation: f64, reach: f64| {
             let view = Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation, azimuth: 0.2, reach };
             rings(&view, &extent)
         };
         let count = |elevation: f64, reach: f64| around(elevation, reach).len();
-        // Low, lower, as the photographs are, and half way from there to the pole; the middle of the box is at 0.
+        // Two lower rings, the mean elevation, and halfway from there to the pole. The centre of the box is at height
+        // 0.
         for sign in [1.0, -1.0] {
             let heights = around(0.4 * sign, PI).into_iter().step_by(12).map(|camera| camera.pose.translation.z);
             let expected = [0.04_f64, 0.2, 0.4, 0.2 + PI / 4.0].map(|angle| sign * 4.0 * angle.sin());
             assert!(heights.zip(expected).all(|(height, expected)| (height - expected).abs() < 1e-12), "{sign}");
         }
-        // A swing of twelve cameras is at seven places.
+        // A swing of twelve cameras has seven positions.
         assert_eq!([count(0.4, PI), count(-0.4, PI), count(0.4, 0.6)], [48, 48, 28]);
-        // At the horizon, and half way up.
+        // At the horizon, and halfway up.
         assert_eq!([count(0.0, PI), count(0.0, 0.6)], [24, 14]);
     }
 }

@@ -1,5 +1,5 @@
-//! A scene as one HTML page that renders itself: the table, the networks and the occupied cells, and a program for the graphics
-//! card that marches through them as views do.
+//! Export of a scene page: one HTML file with the hash table, the MLPs and the occupancy grid. Its WebGL shader marches
+//! rays as renders of raygrad do.
 
 use std::any::Any;
 use std::path::Path;
@@ -24,7 +24,7 @@ const STYLE: &str = include_str!("page/scene.css");
 const SCRIPT: &str = include_str!("page/scene.js");
 const SHADER: &str = include_str!("page/scene.frag");
 
-/// Numbers in a row of the table, and in a layer of a network, that a graphics card works with at most.
+/// Most features per table entry, and most width of a layer, that the shader supports.
 const MOST_FEATURES: usize = 16;
 const MOST_WIDTH: usize = 256;
 
@@ -38,7 +38,7 @@ pub fn run(run: &Run, out: &Path, job: &Job) -> Result<()> {
     print(&format!("exported a scene page of {megabytes:.1} MB: {}\n", out.display()))
 }
 
-/// What a page can be made of, or why there is none.
+/// Checks that a page can show the model; returns the reason if not.
 fn check(model: &Model<f32>) -> std::result::Result<(&InstantConfig, &Marching), String> {
     let (Some(config), Some(marching)) = (model.config.field.get::<InstantConfig>(), model.marching()) else {
         return Err(format!(
@@ -65,7 +65,7 @@ fn check(model: &Model<f32>) -> std::result::Result<(&InstantConfig, &Marching),
     Ok((config, marching))
 }
 
-/// The text of the page, or why there is none. `mark` says what wrote it.
+/// The text of the page, or the reason why there is none. `mark` identifies the job that wrote it.
 fn page(run: &Run, model: &Model<f32>, mark: &str) -> std::result::Result<String, String> {
     let (config, marching) = check(model)?;
     let grid = HashGrid::new(&config.grid).map_err(|error| error.to_string())?;
@@ -104,7 +104,7 @@ fn page(run: &Run, model: &Model<f32>, mark: &str) -> std::result::Result<String
         ("camera", view::CAMERA.to_owned()),
         ("script", SCRIPT.to_owned()),
         ("shader", SHADER.to_owned()),
-        // Within a script nothing may look like its end.
+        // The data must not end the script element.
         ("data", data.to_string().replace("</", "<\\/")),
         ("files", files.to_string()),
         ("mark", mark.to_owned()),
@@ -112,12 +112,12 @@ fn page(run: &Run, model: &Model<f32>, mark: &str) -> std::result::Result<String
     Ok(filled(PAGE, &texts))
 }
 
-/// JSON knows no infinity: as far as anything can be told apart.
+/// JSON has no infinity, so that a large number replaces it.
 fn finite(x: f64) -> f64 {
     x.clamp(-1e18, 1e18)
 }
 
-/// How places of the scene become places of the unit cube.
+/// The map from scene coordinates to the unit cube.
 fn space(model: &Model<f32>) -> Value {
     let space = model.space();
     let [low, high] = space.bounds;
@@ -160,7 +160,7 @@ fn parameter<'a>(model: &'a Model<f32>, name: &str) -> std::result::Result<(&'a 
     Ok((tensor.as_slice(), [shape[0], shape[1]]))
 }
 
-/// The table in half precision.
+/// The hash table in half precision.
 fn table(model: &Model<f32>) -> std::result::Result<Vec<u8>, String> {
     let (table, _) = parameter(model, "field.table")?;
     let halves: Vec<f16> = table.iter().map(|x| f16::from_f32(*x)).collect();
@@ -170,8 +170,8 @@ fn table(model: &Model<f32>) -> std::result::Result<Vec<u8>, String> {
     }
 }
 
-/// The weights of all layers, each row of outputs filled up to a multiple of four, each layer to such a number of rows; before
-/// the first layer of colours what the mean code of the photographs adds to its outputs.
+/// The weights of all layers. Rows are padded to a multiple of four outputs, and layers to a multiple of four rows.
+/// Before the first colour layer comes the contribution of the mean appearance embedding to its outputs.
 fn weights(model: &Model<f32>, config: &InstantConfig) -> std::result::Result<Vec<u8>, String> {
     let field: &dyn Any = &*model.field;
     let levels = field.downcast_ref::<Instant>().and_then(|field| field.grid().weights());
@@ -187,7 +187,7 @@ fn weights(model: &Model<f32>, config: &InstantConfig) -> std::result::Result<Ve
     for name in ["field.density.0.weight", "field.density.1.weight"] {
         let (values, [_, outputs]) = parameter(model, name)?;
         match levels.filter(|_| name.contains("density.0")) {
-            // What features are multiplied by may as well be in the weights.
+            // The level weights of features are multiplied into the MLP weights.
             Some(levels) => {
                 let scaled = values.chunks(outputs).enumerate().flat_map(|(row, weights)| {
                     let level = levels[row / config.grid.features] as f32;
@@ -228,7 +228,7 @@ mod tests {
 
     use super::*;
 
-    /// So small that it is worked out by hand.
+    /// Small enough for expected values by hand.
     fn small() -> InstantConfig {
         InstantConfig {
             grid: HashGridConfig { levels: 4, features: 1, log2_table: 4, coarsest: 1, finest: 4 },
@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn scene_page_pads_layers_and_averages_embeddings() {
+    fn weights_are_padded_with_mean_embedding() {
         let config = small();
         let mut model = model(config.clone(), as_it_is);
         let count = |from: u32, count: u32| (from..from + count).map(|x| x as f32).collect::<Vec<f32>>();
@@ -269,7 +269,7 @@ mod tests {
         give(&mut model, "field.density.1.weight", &count(200, 15));
         give(&mut model, "field.color.0.weight", &count(300, 12));
         give(&mut model, "field.color.1.weight", &count(400, 6));
-        // On average 2 and 3, of rows (308, 309) and (310, 311).
+        // The mean embedding is (2, 3), for the rows (308, 309) and (310, 311).
         give(&mut model, "field.codes", &[1.0, 2.0, 3.0, 4.0]);
         let bytes = weights(&model, &config).unwrap();
         let found: Vec<f32> = bytes.chunks(4).map(|x| f32::from_le_bytes(x.try_into().unwrap())).collect();
@@ -292,7 +292,7 @@ mod tests {
             rows(400, 2, 3, 4, 4),
         ];
         assert_eq!(found, expected.concat());
-        // Half of the detail that comes in: the finest of the levels, in the last row, counts half.
+        // At half of the detail, the finest level in the last row has weight one half.
         model.set_detail(0.5);
         let bytes = weights(&model, &config).unwrap();
         let half = bytes.chunks(4).map(|x| f32::from_le_bytes(x.try_into().unwrap()));
@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_is_in_half_precision_or_there_is_no_page() {
+    fn table_is_half_precision_or_fails() {
         let mut model = model(small(), as_it_is);
         let mut values = vec![0.0; model.params.get(model.params.find("field.table").unwrap()).as_slice().len()];
         (values[0], values[1]) = (1.0, -2.5);
@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn places_become_those_of_the_unit_cube() {
+    fn space_maps_to_the_unit_cube() {
         assert_eq!(space(&model(small(), as_it_is)), json!({ "kind": 0, "middle": [-1.0, -1.0, -1.0], "scale": 0.25 }));
         let unbounded = model(small(), |config, _| config.unbounded = true);
         assert_eq!(space(&unbounded), json!({ "kind": 1, "middle": [0.0, 1.0, 0.0], "scale": 1.0 }));
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_page_marches_through_is_what_views_do() {
+    fn march_settings_equal_those_of_renders() {
         let model = model(small(), as_it_is);
         let marching = model.marching().unwrap();
         let (told, step, limits) = (march(&model, marching), marching.view_spacing(), model.sampler.tolerance());
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_page_can_show_is_said() {
+    fn check_unsupported_models_gives_the_reason() {
         let refused = |model: &Model<f32>| check(model).map(drop).unwrap_err();
         let with = |change: &dyn Fn(&mut InstantConfig)| {
             let mut config = small();

@@ -1,31 +1,31 @@
-//! Animations as GIF and as APNG files.
+//! GIF and APNG animations.
 
 use std::io::Write;
 
 use gif::Repeat;
 use raygrad::nerf::{Image, quantise};
 
-/// Effort of choosing 256 colours, from 1 (most) to 30.
+/// Quantiser speed for 256 colours, from 1 (best quality) to 30.
 const QUANTISER_SPEED: i32 = 10;
 
-/// An endless animation that is written frame by frame, RGB images of one size.
+/// An endless animation, written frame by frame. All RGB images have one size.
 pub enum Animation<W: Write> {
-    /// Each frame has 256 colours of its own.
+    /// Each frame has its own 256 colours.
     Gif {
-        /// What writes it.
+        /// The encoder.
         encoder: Box<gif::Encoder<W>>,
-        /// Frames a second.
+        /// Frames per second.
         fps: f64,
-        /// Frames so far.
+        /// Number of frames so far.
         frames: u32,
     },
-    /// Every colour as it is.
+    /// Lossless colours.
     Apng(Box<png::Writer<W>>),
 }
 
 impl<W: Write> Animation<W> {
-    /// A GIF without frames, with a comment. A frame is shown for a whole number of hundredths of a second, and the video for as
-    /// long as it should.
+    /// An empty GIF with a comment. Frame times are in hundredths of a second and are rounded, so that the total time
+    /// is exact.
     pub fn gif(to: W, [width, height]: [u16; 2], fps: f64, comment: &str) -> Result<Self, String> {
         let mut encoder = gif::Encoder::new(to, width, height, &[]).map_err(|e| e.to_string())?;
         encoder.set_repeat(Repeat::Infinite).map_err(|e| e.to_string())?;
@@ -34,14 +34,14 @@ impl<W: Write> Animation<W> {
         Ok(Animation::Gif { encoder: Box::new(encoder), fps, frames: 0 })
     }
 
-    /// An APNG that is to have so many frames, with a comment.
+    /// An empty APNG of this number of frames, with a comment.
     pub fn apng(to: W, [width, height]: [u16; 2], fps: f64, frames: u32, comment: &str) -> Result<Self, String> {
         let mut encoder = png::Encoder::new(to, width.into(), height.into());
         encoder.add_text_chunk("Comment".to_owned(), comment.to_owned()).map_err(|e| e.to_string())?;
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
         let animated = encoder.set_animated(frames, 0);
-        // A frame is shown for a share of a second, or for hundredths of a second.
+        // The delay is a fraction with 16-bit terms, so that slow rates use hundredths of a second.
         let (delay, of) =
             if fps < 1.0 { ((100.0 / fps).round() as u16, 100) } else { (100, (100.0 * fps).round() as u16) };
         let animated = animated.and_then(|()| encoder.set_frame_delay(delay, of));
@@ -49,7 +49,7 @@ impl<W: Write> Animation<W> {
         Ok(Animation::Apng(Box::new(writer)))
     }
 
-    /// Adds an image.
+    /// Appends a frame.
     pub fn push(&mut self, image: &Image) -> Result<(), String> {
         let bytes: Vec<u8> = image.data.iter().map(|&value| quantise(value)).collect();
         match self {
@@ -65,7 +65,7 @@ impl<W: Write> Animation<W> {
         }
     }
 
-    /// Ends the file.
+    /// Finishes the file.
     pub fn finish(self) -> Result<(), String> {
         match self {
             Animation::Gif { encoder, .. } => {
@@ -81,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn apng_frames_last_as_long_as_they_should() {
+    fn apng_frame_delay_matches_the_rate() {
         for fps in [0.01, 0.015, 0.7, 1.0, 12.5, 29.97, 240.0] {
             let mut bytes = vec![];
             let mut animation = Animation::apng(&mut bytes, [4, 3], fps, 1, "a comment").unwrap();
@@ -99,8 +99,8 @@ mod tests {
     }
 
     #[test]
-    fn a_gif_takes_as_long_as_its_frames_should() {
-        // 30 frames a second are no whole number of hundredths each.
+    fn gif_total_time_matches_the_rate() {
+        // At 30 frames per second, a frame is not a whole number of hundredths.
         for (fps, frames) in [(30.0, 60), (40.0, 7), (25.0, 5)] {
             let mut bytes = vec![];
             let mut animation = Animation::gif(&mut bytes, [4, 3], fps, "a comment").unwrap();

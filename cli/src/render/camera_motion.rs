@@ -1,4 +1,4 @@
-//! Where the camera goes: by name or as a file says, and what flags make of it.
+//! Camera paths: named ones, paths from files, and options that change them.
 
 use std::path::PathBuf;
 
@@ -18,16 +18,17 @@ use crate::{builtin, parse};
 
 /// Most frames of a video.
 const MOST_FRAMES: usize = 100_000;
-/// Frames of an orbit.
+/// Default frames of an orbit.
 const ORBIT_FRAMES: usize = 60;
-/// Frames of a longer path, as many as LLFF's spiral has.
+/// Default frames of other paths, as in LLFF's spiral.
 const FRAMES: usize = 120;
-/// Frames a second, where nothing says how many.
+/// Default frames per second.
 const FPS: f64 = 25.0;
-/// Where cameras have no average, how far a spiral goes from the orbit's first, as a share of its distance from the middle.
+/// Radius of a spiral about the orbit's first camera, as a fraction of its distance from the centre. Used if the
+/// cameras have no mean.
 const SPIRAL_SHARE: f64 = 0.1;
 
-/// Flags about where the camera goes.
+/// Options of the camera path.
 #[derive(Debug, Clone, Default, clap::Args, Serialize)]
 pub struct CameraPathArgs {
     /// Kind of path, or FILE.json
@@ -96,12 +97,12 @@ pub struct CameraPathArgs {
     path_transform: Option<PathBuf>,
 }
 
-/// A path that may not be Unicode.
+/// Serialises a path, which may not be Unicode.
 fn lossy<S: Serializer>(path: &Option<PathBuf>, serializer: S) -> std::result::Result<S::Ok, S::Error> {
     path.as_ref().map(|path| path.to_string_lossy()).serialize(serializer)
 }
 
-/// Where the camera goes.
+/// The camera path.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub enum CameraPath {
     #[default]
@@ -124,7 +125,7 @@ impl CameraPath {
         }
     }
 
-    /// What it is called, and the folder of its pictures.
+    /// Name of the path, and of the folder of its renders.
     pub fn name(&self) -> &'static str {
         match self {
             CameraPath::Orbit => "orbit",
@@ -136,15 +137,15 @@ impl CameraPath {
     }
 }
 
-/// Cameras, at least one, all of one size, and how fast they are shown.
+/// Cameras of the same size, at least one, with the frame rate.
 pub struct CameraMotion {
     pub cameras: Vec<Camera>,
-    /// Frames a second.
+    /// Frames per second.
     pub fps: f64,
 }
 
 impl CameraPathArgs {
-    /// The cameras along the path, in the scene's coordinates.
+    /// The cameras along the path, in scene coordinates.
     pub fn cameras(&self, run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<CameraMotion> {
         self.check()?;
         let (view, extent) = (&run.config.viewpoint, &run.config.scene_box);
@@ -166,7 +167,7 @@ impl CameraPathArgs {
             CameraPath::Test => {
                 let all = photographs(run, model, scene, Split::Test)?;
                 let some = evenly_spaced(all, self.frames.unwrap_or(usize::MAX));
-                // Of the size that they were read in, to the pixel.
+                // The exact size of the downscaled image.
                 let small = |side: usize| ((side as f64 / run.config.downscale as f64).round() as usize).max(1);
                 let camera = |camera: Camera| camera.resized(small(camera.width), small(camera.height));
                 flight(some.into_iter().map(|photograph| camera(photograph.camera)).collect())?
@@ -189,7 +190,7 @@ impl CameraPathArgs {
                     }
                 };
                 let given: Vec<Camera> = keys.iter().map(|key| extent.transform.camera(&key.camera(usual))).collect();
-                // Where the model has found that to be, but with the lens that the file says.
+                // Poses follow the learned transform of the cameras. The lens is that of the file.
                 let found = model.other_cameras(&given).into_iter().zip(given);
                 (found.map(|(found, camera)| Camera { pose: found.pose, ..camera }).collect(), usual, fps)
             }
@@ -207,7 +208,7 @@ impl CameraPathArgs {
         Ok(CameraMotion { cameras: cameras.iter().map(fit).collect(), fps })
     }
 
-    /// Whether the flags have a meaning for the path.
+    /// Fails if an option does not apply to the path.
     fn check(&self) -> Result<()> {
         use CameraPath::*;
         let (round, way) = (matches!(self.path, Orbit | Spiral), self.path == Spline);
@@ -235,7 +236,7 @@ impl CameraPathArgs {
         Ok(())
     }
 
-    /// How many frames there are.
+    /// Number of frames.
     fn count(&self, usual: usize, fps: f64) -> Result<usize> {
         let timed = self.seconds.map(|seconds| (seconds * fps).round().max(1.0) as usize);
         let count = self.frames.or(timed).unwrap_or(usual);
@@ -273,14 +274,13 @@ impl CameraPathArgs {
     }
 }
 
-/// What LLFF's spiral looks at, for the nearest and the farthest depth that photographs show: a weighted mean of them
-/// in inverse depth.
+/// The focus of LLFF's spiral for the nearest and the farthest visible depth: a weighted harmonic mean.
 fn llff_focus([near, far]: [f64; 2]) -> f64 {
     let [near, far] = [0.9 * near, 5.0 * far];
     (0.25 / near + 0.75 / far).recip()
 }
 
-/// The photographs of these numbers or names.
+/// The images of these numbers or names.
 fn chosen(photographs: &[Photograph], words: &[String], split: Split) -> Result<Vec<Keyframe>> {
     let number = |word: &String| {
         let named = photographs.iter().position(|photograph| photograph.name == *word);
@@ -301,13 +301,14 @@ mod tests {
     use raygrad::nerf::glam::DVec3;
 
     #[test]
-    fn spiral_focus_matches_published_code() {
-        // close_depth, inf_depth = bds.min()*.9, bds.max()*5.; dt = .75; 1./(((1.-dt)/close_depth + dt/inf_depth))
+    fn llff_focus_matches_published_code() {
+        // Published code: close_depth, inf_depth = bds.min()*.9, bds.max()*5.; dt = .75; 1./(((1.-dt)/close_depth +
+        // dt/inf_depth))
         assert!((llff_focus([2.0, 30.0]) - 6.949806949806949).abs() < 1e-12);
     }
 
     #[test]
-    fn spiral_winds_about_images_or_the_orbit() {
+    fn spiral_centre_is_mean_camera_or_orbit() {
         let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::new(1.0, 1.0, 3.0)], [0.5, 9.0]);
         let view =
             Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation: 0.3, azimuth: 0.0, reach: 0.4 };
@@ -318,19 +319,19 @@ mod tests {
         };
         let args = CameraPathArgs { radius: Some(3.0), ..CameraPathArgs::default() };
         let spiral = |photographs: Vec<Photograph>| args.spiral(&view, &extent, &photographs);
-        // Its focus is as far as the middle of the box, or as LLFF has it.
+        // The focus distance is that of the box's centre, or follows LLFF.
         let ahead = spiral((0..11).map(|i| photograph(i, 1.0, None)).collect());
         assert!((ahead.focus - 4.0).abs() < 1e-12 && (ahead.radii[0] - 1.5).abs() < 1e-12, "{ahead:?}");
         let known = spiral((0..11).map(|i| photograph(i, 1.0, Some([2.0 + i as f64, 20.0 + i as f64]))).collect());
         assert!((known.focus - 6.949806949806949).abs() < 1e-12);
-        // From both sides: as the first camera of the orbit, a tenth of the way about it, here three.
+        // Cameras on both sides: the first camera of the orbit, and a tenth of its distance, times 3.
         let around = spiral((0..10).map(|i| photograph(i, if i % 2 == 0 { 1.0 } else { -1.0 }, None)).collect());
         assert!(around.pose.abs_diff_eq(view.orbit(&extent, 1)[0].pose, 1e-12) && (around.focus - 4.0).abs() < 1e-12);
         assert!(around.radii.iter().all(|radius| (radius - 1.2).abs() < 1e-12));
     }
 
     #[test]
-    fn flags_that_a_path_does_not_know_are_named() {
+    fn check_option_of_other_paths_is_refused() {
         let of = |path: &str| CameraPathArgs { path: CameraPath::parse(path).unwrap(), ..CameraPathArgs::default() };
         let fails = |args: CameraPathArgs, expected: &str| {
             let message = args.check().unwrap_err().to_string();

@@ -1,4 +1,4 @@
-//! Frames in a folder, one file each, which another call goes on with.
+//! Numbered frames in a folder, which an interrupted command can resume.
 
 use std::path::{Path, PathBuf};
 
@@ -12,14 +12,14 @@ use crate::output::{complain, make_folder, note, numbered, other_numbered, paren
 use crate::overwrite::{Job, png_with_text, taken};
 use crate::run::write_json;
 
-/// Digits of the number of a frame.
+/// Digits of a frame number.
 pub const DIGITS: usize = 4;
-/// The file that says what the frames of a folder are pictures of, while some are to come.
+/// The file that describes the frames of a folder until all are complete.
 const RECORD: &str = "unfinished.json";
-/// The file by which a program keeps others from writing frames there.
+/// Lock file of a program that writes frames.
 const LOCK: &str = "unfinished.lock";
 
-/// Frames of a path, some of which may be there already.
+/// The frames of a path, some of which may exist.
 pub struct Frames {
     folder: PathBuf,
     record: Record,
@@ -27,27 +27,29 @@ pub struct Frames {
     lock: Lock,
 }
 
-/// What is written down beside frames.
+/// The contents of the record file.
 #[derive(Serialize, Deserialize)]
 struct Record {
-    /// All that decides what they show.
+    /// All inputs of the frames.
     of: Value,
-    /// What was asked for: the mark of the job.
+    /// The mark of the job.
     #[serde(default)]
     job: String,
-    /// How many are there, from the first.
+    /// Number of complete frames, from the first.
     done: usize,
-    /// Whether pictures by number were there before the first frame, which somebody may want to keep.
+    /// True if numbered images existed before the first frame. They may be the user's.
     #[serde(default)]
     strange: bool,
 }
 
 impl Frames {
-    /// `count` frames in a folder, which is made. Frames that an interrupted call has left there are kept if they are `of` the
-    /// same; all others are replaced one by one, with what is to be saved beside them.
+    /// Opens `count` frames in a folder, and creates the folder. Frames of an interrupted command are kept if `of` is
+    /// equal. All others are replaced one by one, with their layers.
     ///
     /// # Errors
-    /// If another job has written one of them, the folder cannot be written, or another program writes frames there.
+    ///
+    /// Fails if another job has written one of the files, the folder is not writable, or another program writes frames
+    /// there.
     pub fn new(folder: PathBuf, of: Value, job: &Job, count: usize, save: &[Layer]) -> Result<Self> {
         check(&folder, record(&folder).as_ref(), &of, job, count, save)?;
         make_folder(&folder)?;
@@ -72,7 +74,7 @@ impl Frames {
         Ok(frames)
     }
 
-    /// How many there are, from the first.
+    /// Number of complete frames, from the first.
     pub fn done(&self) -> usize {
         self.record.done
     }
@@ -82,10 +84,10 @@ impl Frames {
         &self.folder
     }
 
-    /// Writes the next frame: what is saved beside it, and last the picture.
+    /// Writes the next frame: its layers first, then the image.
     pub fn push(&mut self, picture: &[u8], layers: &[(Layer, Vec<u8>)]) -> Result<()> {
         let path = self.path(self.record.done);
-        // Somebody may have put a file there meanwhile.
+        // A file may have appeared meanwhile.
         self.job.check(&path)?;
         for (layer, bytes) in layers {
             let file = beside(&self.folder, self.record.done, *layer);
@@ -100,7 +102,7 @@ impl Frames {
         self.write()
     }
 
-    /// Whether the folder is still the one that was locked.
+    /// Checks that the folder is still the locked one.
     fn check_lock(&self) -> Result<()> {
         let what = match self.lock.state() {
             State::Kept => return Ok(()),
@@ -110,7 +112,7 @@ impl Frames {
         Err(Error::file(&self.folder, what))
     }
 
-    /// Leaves the frames as they are, with nothing to go on with.
+    /// Keeps the frames and removes the record.
     pub fn keep(self) {
         if self.check_lock().is_err() {
             return;
@@ -119,8 +121,7 @@ impl Frames {
         self.lock.remove();
     }
 
-    /// Removes all frames, and the folder unless there is something else in it. If pictures were there before that somebody may
-    /// want to keep, all stay.
+    /// Removes all frames, and the folder if it is empty then. Keeps everything if numbered images existed before.
     pub fn remove(self) {
         if self.check_lock().is_err() {
             return;
@@ -147,20 +148,20 @@ impl Frames {
     }
 }
 
-/// What is written down in a folder; what cannot be read is nothing.
+/// The record of a folder; `None` if it cannot be read.
 fn record(folder: &Path) -> Option<Record> {
     std::fs::read(folder.join(RECORD)).ok().and_then(|text| serde_json::from_slice(&text).ok())
 }
 
-/// The file of a layer of a frame.
+/// The file of a frame's layer.
 fn beside(folder: &Path, frame: usize, layer: Layer) -> PathBuf {
     let (name, ending) = layer.place();
     folder.join(name).join(numbered(frame, DIGITS)).with_extension(ending)
 }
 
-/// Whether a job may write so many frames to a folder: those that are there, and what lies beside them, are its own.
+/// Checks that a job may write its frames and layers to a folder: existing files must be its own.
 fn check(folder: &Path, left: Option<&Record>, of: &Value, job: &Job, count: usize, save: &[Layer]) -> Result<()> {
-    // Of the same, too, where a run was moved meanwhile.
+    // A moved run has another mark but the same inputs.
     if job.overwrites() || left.is_some_and(|left| left.job == job.mark() || left.of == *of) {
         return Ok(());
     }
@@ -180,7 +181,7 @@ fn check(folder: &Path, left: Option<&Record>, of: &Value, job: &Job, count: usi
     Ok(())
 }
 
-/// The names of what differs between two records.
+/// The keys whose values differ between two records.
 fn differing<'a>(a: &'a Value, b: &'a Value) -> Vec<&'a str> {
     let names = |value: &'a Value| value.as_object().into_iter().flat_map(|fields| fields.keys().map(String::as_str));
     let mut names: Vec<&str> = names(a).chain(names(b)).filter(|name| a.get(name) != b.get(name)).collect();
@@ -198,13 +199,13 @@ mod tests {
         Job::new("render", &json!(number), overwrites)
     }
 
-    /// Three frames of job 0 at most, of a model.
+    /// Up to three frames of job 0 with this model.
     fn frames(folder: &Path, model: u32) -> Frames {
         Frames::new(folder.into(), json!({ "model": model }), &job(0, false), 3, &[Layer::DepthNpy]).unwrap()
     }
 
     #[test]
-    fn frames_are_gone_on_with_if_they_are_of_the_same() {
+    fn new_equal_inputs_resumes_frames() {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("frames");
         let begin = |model: u32| frames(&folder, model);
@@ -216,7 +217,7 @@ mod tests {
         assert_eq!((read("0002.png")[0], read("depth/0002.npy")), (2, vec![12]));
         drop(first);
         assert_eq!(begin(1).done(), 3);
-        // From one that is no longer there on.
+        // Resumes at the first missing frame.
         std::fs::remove_file(folder.join("0001.png")).unwrap();
         let mut again = begin(1);
         assert_eq!(again.done(), 1);
@@ -224,18 +225,18 @@ mod tests {
         assert_eq!(read("0001.png")[0], 7);
         drop(again);
         assert_eq!(begin(2).done(), 0);
-        // It was begun again: what lies there now is of another model.
+        // The record was replaced, so the frames count as those of another model.
         assert_eq!(begin(1).done(), 0);
         std::fs::write(folder.join(RECORD), "{").unwrap();
         assert_eq!(begin(1).done(), 0);
         begin(3).keep();
         assert!(!folder.join(RECORD).exists() && folder.join("0000.png").exists());
         std::fs::remove_dir_all(folder.join("depth")).unwrap();
-        // What was there before without a record stays.
+        // Images that existed without a record are kept.
         begin(3).remove();
         assert!(folder.join("0002.png").exists());
         assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 3, "nothing but the frames");
-        // After an interruption too.
+        // They are also kept after an interruption.
         drop(begin(3));
         begin(3).remove();
         assert!(folder.join("0002.png").exists());
@@ -246,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_folder_has_one_writer_and_names_changes() {
+    fn new_while_locked_fails_and_keys_differ() {
         let place = tempfile::tempdir().unwrap();
         let again = || Frames::new(place.path().into(), json!({}), &job(0, false), 3, &[]);
         let frames = again().unwrap();
@@ -259,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_others_are_not_replaced() {
+    fn new_refuses_files_of_other_jobs() {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path();
         let of = |job: &Job| json!({ "job": job.mark() });
@@ -270,20 +271,20 @@ mod tests {
             let left = [RECORD, LOCK].map(|name| folder.join(name).exists());
             assert_eq!(left, [false; 2], "nothing is left there");
         };
-        // Photographs by number, of which one would be replaced; those beyond are not.
+        // Numbered images of the user: one within the range is refused, later ones are not.
         std::fs::write(folder.join("0003.png"), b"photograph").unwrap();
         new(&job(0, false), &[]).unwrap();
         Frames::new(folder.into(), of(&job(0, false)), &job(0, false), 3, &[]).unwrap().keep();
         std::fs::write(folder.join("0002.png"), b"photograph").unwrap();
         refused(&job(0, false), &[], "0002.png");
         std::fs::remove_file(folder.join("0002.png")).unwrap();
-        // Depths that were measured.
+        // Measured depths of the user.
         std::fs::create_dir(folder.join("depth")).unwrap();
         std::fs::write(folder.join("depth/0001.png"), b"depths").unwrap();
         refused(&job(0, false), &[Layer::Normals, Layer::Depth], "depth/0001.png");
         Frames::new(folder.into(), of(&job(0, true)), &job(0, true), 3, &[Layer::Depth]).unwrap().keep();
         std::fs::remove_dir_all(folder.join("depth")).unwrap();
-        // Finished frames of the same job are, with what lies beside them, and those of another are not.
+        // Finished frames and layers of the same job are replaced, those of another job are not.
         let mut frames = Frames::new(folder.into(), of(&job(0, false)), &job(0, false), 3, &[Layer::Depth]).unwrap();
         for i in 0..3_u8 {
             frames.push(&[i], &[(Layer::Depth, vec![i])]).unwrap();
@@ -291,14 +292,14 @@ mod tests {
         frames.keep();
         refused(&job(1, false), &[], "0000.png");
         new(&job(0, false), &[Layer::Depth]).unwrap();
-        // So are unfinished ones.
+        // Unfinished frames of the same job are replaced too.
         std::fs::remove_file(folder.join("0000.png")).unwrap();
         std::fs::write(folder.join("0001.png"), b"cut off").unwrap();
         new(&job(0, false), &[Layer::Depth]).unwrap();
         let error = new(&job(1, false), &[]).unwrap_err().to_string();
         assert!(error.ends_with("holds unfinished frames of another command: repeat that command or add --overwrite"));
         new(&job(1, true), &[]).unwrap();
-        // What shows the same is its own, as where a run was moved; a picture that came meanwhile stays.
+        // Frames with equal inputs count as the job's own, as in a moved run. An image that appears meanwhile is kept.
         let mut frames = Frames::new(folder.into(), of(&job(1, true)), &job(2, false), 3, &[]).unwrap();
         assert_eq!(frames.done(), 0);
         std::fs::write(folder.join("0000.png"), b"photograph").unwrap();
@@ -307,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_a_folder_that_was_replaced_stop() {
+    fn push_to_replaced_folder_fails() {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path().join("frames");
         let mut first = frames(&folder, 1);
@@ -318,9 +319,9 @@ mod tests {
             assert!(first.push(&[1], &layers).unwrap_err().to_string().contains("another raygrad now renders to it"));
         }
         second.push(&[2], &[]).unwrap();
-        // Nor is anything of the other one removed.
+        // Files of the other program are not removed.
         first.remove();
-        // A picture, what is written down, and the two files of a lock.
+        // A frame, the record, and the two files of a lock.
         assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 4);
         let third = frames(&place.path().join("moved"), 1);
         let lock = crate::lock::owner_of(&place.path().join("moved").join(LOCK));

@@ -1,13 +1,13 @@
-//! Camera paths of other programs: nerfstudio's `camera_path.json`, and those that instant-ngp saves.
+//! Camera path files: nerfstudio's `camera_path.json`, and those of instant-ngp.
 //!
-//! Nerfstudio lists the camera of every frame (`camera_path`), and the key frames that it has them from (`keyframes`),
-//! which count where there is no list. Poses are camera-to-world, row by row, of a camera that looks along `-z` with
-//! `y` up; angles are vertical, in degrees. Its world is the capture's, recentred and scaled by what its
-//! `dataparser_transforms.json` says.
+//! Nerfstudio lists the camera of each frame (`camera_path`) and the key frames (`keyframes`). The key frames count
+//! only without a list of frames. Poses are camera-to-world matrices, row by row. Cameras look along `-z` with `y` up,
+//! and angles are vertical, in degrees. The world is that of the capture, recentred and scaled by
+//! `dataparser_transforms.json`.
 //!
-//! Instant-ngp lists key frames of a cubic B-spline: quaternions `x y z w` and positions of a camera that looks along
-//! `z` with `y` down, in its unit cube, whose `x y z` are `y z x` of the capture times 0.33 and one half more, if the
-//! capture's `transforms.json` does not say another scale and offset.
+//! Instant-ngp lists key frames of a cubic B-spline: quaternions `x y z w` and positions. Cameras look along `z` with
+//! `y` down. Positions are in a unit cube. Its `x y z` are `y z x` of the capture times 0.33, plus one half. The
+//! capture's `transforms.json` may set another scale and offset.
 
 use std::path::Path as File;
 
@@ -24,33 +24,33 @@ use crate::parse::{FPS, LARGEST};
 
 /// Most frames and key frames.
 const MOST: usize = 100_000;
-/// The smallest angle of a picture in degrees; the largest is as far from 180.
+/// Smallest vertical angle in degrees. The largest is 180 minus this.
 const SMALLEST_FOV: f64 = 0.001;
-/// The scale and the offset of instant-ngp's unit cube, where nothing is said.
+/// Default scale and offset of instant-ngp's unit cube.
 const NGP: Cube = Cube { scale: 0.33, offset: [0.5; 3] };
-/// How long nerfstudio takes from key frame to key frame, where nothing is said.
+/// Nerfstudio's default seconds between key frames.
 const TRANSITION: f64 = 1.0;
 
-/// A path, in the capture's coordinates.
+/// A path in the capture's coordinates.
 #[derive(Debug)]
 pub struct Path {
     pub motion: Motion,
-    /// The size of its pictures, if the file says.
+    /// Image size, if the file has one.
     pub size: Option<[usize; 2]>,
-    /// Frames a second, if the file says.
+    /// Frames per second, if the file has a rate.
     pub fps: Option<f64>,
 }
 
-/// How cameras move.
+/// Frames or key frames.
 #[derive(Debug)]
 pub enum Motion {
-    /// Every frame is there.
+    /// A list of all frames.
     Frames(Vec<Keyframe>),
-    /// Between key frames, for so long, if the file says.
+    /// Key frames, with the total time if the file has one.
     Keys { path: CameraPath, seconds: Option<f64> },
 }
 
-/// A `camera_path.json` of nerfstudio. What its viewer alone reads has no meaning here.
+/// Nerfstudio's `camera_path.json`. Fields for its viewer are ignored.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Nerfstudio {
@@ -69,18 +69,18 @@ struct Nerfstudio {
     camera_path: Option<Vec<Shot>>,
     keyframes: Option<Value>,
     crop: Option<Value>,
-    /// What it is in, if it says, as raygrad's do.
+    /// Coordinate system, which raygrad's viewer writes.
     coordinates: Option<Coordinates>,
 }
 
 #[derive(Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 enum Coordinates {
-    /// The capture's own.
+    /// The capture's coordinates.
     Capture,
 }
 
-/// One frame.
+/// A frame.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Shot {
@@ -91,7 +91,7 @@ struct Shot {
     render_time: Option<f64>,
 }
 
-/// One key frame.
+/// A key frame.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct NerfstudioKeyframe {
@@ -106,7 +106,7 @@ struct NerfstudioKeyframe {
     _override_time_enabled: Option<bool>,
 }
 
-/// A path of instant-ngp. Where it is being played and what its window shows have no meaning here.
+/// A path of instant-ngp. Fields on playback and display are ignored.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Ngp {
@@ -120,7 +120,7 @@ struct Ngp {
     spline_order: Option<u32>,
 }
 
-/// One key frame.
+/// A key frame.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct NgpKey {
@@ -129,7 +129,7 @@ struct NgpKey {
     #[serde(rename = "T")]
     position: [f64; 3],
     fov: f64,
-    /// With the next, where a lens is in focus, which matters with an aperture alone.
+    /// Focus distance, like the next field. It matters only with an aperture, which is not supported.
     #[serde(rename = "slice")]
     _slice: Option<f64>,
     #[serde(rename = "scale")]
@@ -151,15 +151,15 @@ struct Dataparser {
     scale: f64,
 }
 
-/// What a `transforms.json` says of instant-ngp's unit cube.
+/// The unit cube of instant-ngp, from `transforms.json`.
 #[derive(Deserialize)]
 struct Cube {
     scale: f64,
     offset: [f64; 3],
 }
 
-/// Reads a path and takes it to the capture's coordinates, by what `transform` says; `applied` gives the map from
-/// coordinates of before to those of the capture's file, which nerfstudio's transform has in it.
+/// Reads a path in the capture's coordinates, with the `transform` file. `applied` returns the transform that the
+/// capture's file states as already applied. Nerfstudio's transform includes it.
 pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Result<DAffine3>) -> Result<Path> {
     let document: Value = parse(file)?;
     let has = |name: &str| document.get(name).is_some_and(|value| !value.is_null());
@@ -251,7 +251,8 @@ fn nerfstudio(file: &File, path: Nerfstudio, to_capture: &DAffine3) -> Result<Pa
                 each.map(|(i, frame)| key(format!("keyframes[{i}]"), &frame.matrix, frame.fov, frame.render_time));
             let keys: Vec<Keyframe> = keys.collect::<Result<_>>()?;
             let closed = path.is_cycle.unwrap_or(false) && keys.len() > 1;
-            // A key frame says how long it takes to get to it, the first of a cycle at its end.
+            // A key frame holds the time from the one before it. In a loop, the first one holds the time of the last
+            // leg.
             let usual = path.default_transition_sec.unwrap_or(TRANSITION);
             let seconds = |(i, frame): (usize, &NerfstudioKeyframe)| {
                 let own = frame.override_transition_sec.filter(|_| frame.override_transition_enabled.unwrap_or(false));
@@ -288,7 +289,7 @@ fn ngp(file: &File, path: Ngp, to_capture: &DAffine3) -> Result<Path> {
         if frame.glow_mode != 0 {
             return Err(bad(&format!("{name}.glow_mode"), "must be 0: glow is not supported"));
         }
-        // Its cameras have y down and look along z.
+        // Instant-ngp's cameras have y down and look along z.
         let turned = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
         let matrix3 = DMat3::from_quat(rotation.normalize()) * turned;
         let pose = DAffine3 { matrix3, translation: DVec3::from(frame.position) };
@@ -297,7 +298,7 @@ fn ngp(file: &File, path: Ngp, to_capture: &DAffine3) -> Result<Path> {
     let keys = path.path.iter().enumerate().map(of).collect::<Result<Vec<Keyframe>>>()?;
     let closed = path.closed && keys.len() > 1;
     let legs = if closed { keys.len() } else { keys.len() - 1 };
-    // A time is when the next key frame is reached. Times that do not rise count for nothing.
+    // Timestamps are arrival times of the next key frame. They are ignored unless they increase.
     let stamps: Vec<f64> = path.path.iter().filter_map(|frame| frame.timestamp).collect();
     let lengths = stamps.iter().scan(0.0, |before, stamp| Some(stamp - std::mem::replace(before, *stamp)));
     let mut times: Vec<f64> = lengths.collect();
@@ -317,7 +318,7 @@ fn count(file: &File, field: &str, count: usize) -> Result<()> {
     }
 }
 
-/// A pose and a vertical angle in degrees, in the capture's coordinates.
+/// A key frame in the capture's coordinates, from a pose and a vertical angle in degrees.
 fn key(file: &File, name: &str, pose: DAffine3, fov: f64, to_capture: &DAffine3) -> Result<Keyframe> {
     let bad = |what: String| Error::field(file, name, what);
     rigid::pose(&pose).map_err(|what| bad(format!("its pose {what}")))?;
@@ -332,7 +333,7 @@ fn key(file: &File, name: &str, pose: DAffine3, fov: f64, to_capture: &DAffine3)
     Ok(Keyframe { pose, angle_y: fov.to_radians() })
 }
 
-/// Sixteen numbers row by row.
+/// An affine map from sixteen numbers, row by row.
 fn from_rows(m: &[f64; 16]) -> std::result::Result<DAffine3, String> {
     let last = &m[12..];
     if last.iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(value, expected)| !((value - expected).abs() < 1e-3)) {
@@ -343,7 +344,7 @@ fn from_rows(m: &[f64; 16]) -> std::result::Result<DAffine3, String> {
 }
 
 impl Dataparser {
-    /// From nerfstudio's world to the capture's. A place `x` of before the file's own transform is at `scale *
+    /// The map from nerfstudio's world to the capture. A position `x` before the file's own transform maps to `scale *
     /// (transform x)`.
     fn to_capture(&self, file: &File, applied: DAffine3) -> Result<DAffine3> {
         let row = |r: usize| DVec3::from_slice(&self.transform[r][..3]);
@@ -351,7 +352,7 @@ impl Dataparser {
         let translation = DVec3::from([0, 1, 2].map(|r: usize| self.transform[r][3]));
         let transform = DAffine3 { matrix3, translation };
         rigid::pose(&transform).map_err(|what| Error::field(file, "transform", what))?;
-        // The scale of the file's own transform is in this scale too, and not in the other transform.
+        // Nerfstudio's scale includes that of the file's own transform; its rotation and translation do not.
         let own = applied.matrix3.determinant().cbrt();
         let scale = self.scale / own;
         if !(scale > 0.0 && scale.is_finite()) {
@@ -363,7 +364,7 @@ impl Dataparser {
 }
 
 impl Cube {
-    /// From instant-ngp's unit cube to the capture.
+    /// The map from instant-ngp's unit cube to the capture.
     fn to_capture(&self, file: &File) -> Result<DAffine3> {
         if !(self.scale > 0.0 && self.scale.is_finite()) {
             return Err(Error::field(file, "scale", "must be above 0"));
@@ -372,7 +373,7 @@ impl Cube {
         if !offset.is_finite() {
             return Err(Error::field(file, "offset", "must be three finite numbers"));
         }
-        // Its x is the capture's y, its y the z, its z the x.
+        // Its x, y and z axes are the capture's y, z and x axes.
         let axes = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
         Ok(DAffine3 { matrix3: axes * self.scale.recip(), translation: -offset / self.scale })
     }

@@ -1,4 +1,4 @@
-//! What is shown of a view, and what is saved beside it.
+//! Outputs of a render: the displayed quantity and its layers.
 
 use clap::ValueEnum;
 use raygrad::nerf::dataset::{Depths, SceneTransform};
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::output::depth_colors;
 use crate::precision::Renderer;
 
-/// What frames show.
+/// Displayed quantity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Show {
@@ -24,7 +24,7 @@ pub enum Show {
     Opacity,
 }
 
-/// What is saved beside each frame.
+/// Layer files of each frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Layer {
@@ -41,7 +41,7 @@ pub enum Layer {
 }
 
 impl Layer {
-    /// The folder of its files, and their ending.
+    /// Folder and extension of the files.
     pub fn place(self) -> (&'static str, &'static str) {
         match self {
             Layer::Depth => ("depth", "png"),
@@ -53,33 +53,33 @@ impl Layer {
     }
 }
 
-/// Where less light is blocked there is nothing to have a depth or a normal.
+/// Below this opacity, a pixel has no depth and no normal.
 const SOLID: f32 = 0.5;
 
-/// How frames are made.
+/// Settings of the frames.
 pub struct Shown<'a> {
     pub renderer: &'a Renderer,
-    /// Where the scene lies in its capture.
+    /// Scene box, with the scene transform.
     pub extent: SceneBox,
     pub background: [f32; 3],
     pub show: Show,
     pub save: &'a [Layer],
-    /// The length of a step of depths in 16 bits, in units of the capture.
+    /// Step of 16-bit depths, in capture units.
     pub depth_unit: f64,
 }
 
-/// One frame.
+/// A rendered frame.
 pub struct Frame {
-    /// What is shown.
+    /// The displayed image.
     pub image: Image,
-    /// What is saved beside it: the contents of files.
+    /// Contents of the layer files.
     pub layers: Vec<(Layer, Vec<u8>)>,
-    /// How many depths are too great for 16 bits.
+    /// Number of depths that exceed 16 bits.
     pub beyond: usize,
 }
 
 impl Shown<'_> {
-    /// The frame from a camera.
+    /// Renders the frame of a camera.
     pub fn frame(&self, camera: &Camera) -> Frame {
         let picture = self.renderer.view(camera, self.background);
         let faces = self.show == Show::Normals || self.save.contains(&Layer::Normals);
@@ -126,12 +126,12 @@ pub fn facing(mut normals: Image, placement: &SceneTransform) -> Image {
     normals
 }
 
-/// Depths of what is solid, in units of the capture.
+/// Depths of opaque pixels in capture units.
 fn depths(picture: &Render, camera: &Camera, placement: &SceneTransform) -> Depths {
     Depths::new(&solid(&picture.depth, picture), camera, placement.scale.recip())
 }
 
-/// An image with nothing where nothing is solid.
+/// The image, with 0 where pixels are not opaque.
 fn solid(image: &Image, picture: &Render) -> Image {
     let mut image = image.clone();
     for (pixel, opacity) in image.data.chunks_exact_mut(image.channels).zip(&picture.opacity.data) {
@@ -142,7 +142,7 @@ fn solid(image: &Image, picture: &Render) -> Image {
     image
 }
 
-/// Colours over a background, by the opacity.
+/// Colours over a background, weighted by the opacity.
 pub fn over(colors: &Image, opacity: &Image, background: [f32; 3]) -> Image {
     let mut image = colors.clone();
     for (pixel, opacity) in image.data.chunks_exact_mut(3).zip(&opacity.data) {
@@ -162,8 +162,8 @@ mod tests {
     }
 
     #[test]
-    fn normals_and_depths_are_the_captures() {
-        // What is x, y and z in the capture is y, z and x in the scene, and twice as long.
+    fn normals_and_depths_use_capture_units() {
+        // The capture's x, y and z axes are the scene's y, z and x axes, with scale 2.
         let rotation = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
         let placement = SceneTransform { rotation, scale: 2.0, origin: DVec3::ONE };
         let colors = facing(image(3, &[0.0, 0.7, 0.0, 0.0, 0.0, -0.3, 0.0, 0.0, 0.0]), &placement);

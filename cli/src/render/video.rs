@@ -1,4 +1,4 @@
-//! Videos from frames in a folder: GIF and APNG by ourselves, MP4 and WebM by ffmpeg.
+//! Videos of frames in a folder: GIF and APNG with Rust encoders, MP4 and WebM with ffmpeg.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -16,13 +16,13 @@ use crate::parse::LARGEST;
 use crate::prepare::program::FFMPEG;
 use crate::progress::Progress;
 
-/// A GIF shows a frame for two hundredths of a second at least: players show shorter ones for longer.
+/// Largest frame rate of a GIF, with two hundredths of a second per frame. Players slow down faster ones.
 const FASTEST_GIF: f64 = 50.0;
 
-/// What is counted while a video is written.
+/// Label of the progress while a video is encoded.
 const IN_FILM: &str = "frames encoded";
 
-/// A file that holds a video.
+/// Video file formats.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum VideoFormat {
     Gif,
@@ -31,27 +31,27 @@ pub enum VideoFormat {
     Webm,
 }
 
-/// A video that is to be written.
+/// A video to write.
 pub struct VideoWriter<'a> {
-    /// Where its frames are.
+    /// Folder of the frames.
     pub folder: &'a Path,
-    /// How many there are.
+    /// Number of frames.
     pub count: usize,
-    /// Their width and height.
+    /// Width and height of the frames.
     pub size: [usize; 2],
-    /// How many are shown in a second.
+    /// Frames per second.
     pub fps: f64,
-    /// What the video is of, which it says of itself.
+    /// The job, whose mark goes into the file's metadata.
     pub job: &'a Job,
 }
 
 impl VideoFormat {
-    /// By the ending of a file's name.
+    /// The format of a file extension.
     pub fn of(ending: &str) -> Option<VideoFormat> {
         VideoFormat::from_str(ending, true).ok()
     }
 
-    /// Whether it can be written, before there are frames.
+    /// Checks that the video can be written, before frames are rendered.
     pub fn check(self, out: &Path, fps: f64, size: [usize; 2]) -> Result<()> {
         check_writable(parent(out))?;
         if self == VideoFormat::Gif && fps > FASTEST_GIF {
@@ -70,7 +70,7 @@ impl VideoFormat {
         }
     }
 
-    /// Whether ffmpeg is there and has what this needs.
+    /// Checks that ffmpeg is installed and has the encoder.
     pub fn check_encoder(self, out: &Path) -> Result<()> {
         let or = "or use .gif or .apng, which need no ffmpeg";
         let encoders = FFMPEG.ask(&["-hide_banner", "-encoders"]).map_err(|stop| match stop {
@@ -84,12 +84,12 @@ impl VideoFormat {
         Err(Error::file(out, format!("needs {encoder}, which this ffmpeg lacks: install an ffmpeg that has it, {or}")))
     }
 
-    /// What ffmpeg writes it with.
+    /// The encoder of ffmpeg.
     fn encoder(self) -> &'static str {
         if self == VideoFormat::Webm { "libvpx-vp9" } else { "libx264" }
     }
 
-    /// Writes it, replacing the file as a whole.
+    /// Writes the video and replaces the file atomically.
     pub fn write(self, reel: &VideoWriter<'_>, out: &Path) -> Work<()> {
         let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
         let place = tempfile::Builder::new().prefix(".tmp").tempdir_in(parent(out)).map_err(bad)?;
@@ -107,7 +107,7 @@ impl VideoFormat {
         Ok(std::fs::rename(&file, out).map_err(bad)?)
     }
 
-    /// By ffmpeg.
+    /// Encodes with ffmpeg.
     fn encode(self, reel: &VideoWriter<'_>, out: &Path, file: &Path) -> Work<()> {
         let &VideoWriter { folder, count, size, fps, job } = reel;
         let even = size.map(|side| side.next_multiple_of(2));
@@ -116,12 +116,12 @@ impl VideoFormat {
             note(&format!("{}: padded with black to {width}x{height}, because videos need even sides", out.display()));
         }
         let mut command = FFMPEG.command();
-        // In the folder, whose name may hold what ffmpeg reads as a number.
+        // ffmpeg runs in the folder, since it would read a `%` in the folder's name as a pattern.
         command.current_dir(folder);
         command.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-nostats", "-progress", "pipe:1", "-y"]);
         command.args(["-framerate", &fps.to_string(), "-start_number", "0", "-i", &format!("%0{DIGITS}d.png")]);
         command.args(["-frames:v", &count.to_string()]);
-        // Players take an unnamed matrix by the size; this is named.
+        // Players guess the colour matrix from the size if it is not stated.
         let filter = "pad=ceil(iw/2)*2:ceil(ih/2)*2,\
                       scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+full_chroma_int";
         command.args(["-vf", filter, "-pix_fmt", "yuv420p", "-colorspace", "bt709", "-color_primaries", "bt709"]);
@@ -141,7 +141,7 @@ impl VideoFormat {
     }
 }
 
-/// By one of our encoders.
+/// Encodes with a Rust encoder.
 fn animate(
     reel: &VideoWriter<'_>,
     out: &Path,
@@ -162,7 +162,7 @@ fn animate(
     Ok(animation.finish().map_err(bad)?)
 }
 
-/// The folder of a video's frames, beside it.
+/// The folder of a video's frames, beside the video.
 pub fn frames_of(video: &Path) -> PathBuf {
     let mut name = video.as_os_str().to_owned();
     name.push(".frames");
@@ -175,7 +175,7 @@ mod tests {
     use serde_json::Value;
 
     #[test]
-    fn a_file_that_came_meanwhile_stays() {
+    fn write_keeps_a_file_of_another_job() {
         let place = tempfile::tempdir().unwrap();
         let (folder, out) = (place.path(), place.path().join("walk.gif"));
         Image::new(4, 3, 3).save_png(folder.join(numbered(0, DIGITS))).unwrap();
@@ -192,7 +192,7 @@ mod tests {
             );
             assert_eq!(std::fs::read(&out).unwrap(), b"footage");
             write(video, true).unwrap();
-            // Its own is replaced.
+            // The job's own file is replaced.
             write(video, false).unwrap();
         }
         assert_eq!(std::fs::read_dir(folder).unwrap().count(), 2, "nothing is left beside it");

@@ -128,7 +128,7 @@ pub fn changed(config: &Config, name: &str, value: &Value) -> Result<Config> {
     serde_json::from_value(all).map_err(|e| Error::setting(name, format!("cannot be {value}: {e}")))
 }
 
-/// Training time in which a preset reaches a good picture.
+/// Training time for a good result with a preset.
 fn default_budget(preset: Preset) -> Duration {
     match preset {
         Preset::Instant | Preset::Voxel => Duration::from_secs(45),

@@ -1,7 +1,7 @@
 use super::*;
 use serde_json::json;
 
-/// What a file is read as, with a transform and what was applied before.
+/// Reads a document with a transform file and an applied transform.
 fn of(document: &Value, transform: Option<&Value>, applied: DAffine3) -> Result<Path> {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("path.json");
@@ -14,7 +14,7 @@ fn of(document: &Value, transform: Option<&Value>, applied: DAffine3) -> Result<
     read(&file, transform, || Ok(applied))
 }
 
-/// A pose without symmetry, row by row: a turn by 1.1 about (3, -1, 0.5).
+/// A pose without symmetry, row by row: a rotation by 1.1 about (3, -1, 0.5).
 const POSE: [f64; 16] = [
     0.9333653806616558,
     -0.299106292455634,
@@ -57,21 +57,21 @@ fn shots(path: Path) -> Vec<Keyframe> {
 }
 
 #[test]
-fn frames_of_nerfstudio_are_taken_as_they_are() {
+fn read_nerfstudio_frames_keeps_poses() {
     let path = of(&nerfstudio_path(), None, DAffine3::IDENTITY).unwrap();
     assert_eq!((path.size, path.fps), (Some([400, 300]), Some(24.0)));
     let keys = shots(path);
     close(&keys[0].pose, &POSE);
     assert_eq!(keys[1].pose.translation, DVec3::splat(5.0));
-    // Angles are vertical: 60 degrees are 300 pixels at this focal length.
+    // Angles are vertical: 60 degrees span 300 pixels at this focal length.
     let camera = keys[0].camera([400, 300]);
     assert!(camera.focal.iter().all(|focal| (focal - 259.8076211353316).abs() < 1e-9), "{camera:?}");
 }
 
 #[test]
-fn nerfstudios_world_is_left_by_its_transform() {
-    // The pose above in a world that is turned by 0.7 about (1, 2, 3), moved by (0.1, -0.2, 0.3) and scaled by 0.4,
-    // where the capture's file had y, x and -z of before for its x, y and z, half a unit on in x. By NumPy.
+fn read_nerfstudio_transform_is_inverted() {
+    // The pose above in a world that is rotated by 0.7 about (1, 2, 3), translated by (0.1, -0.2, 0.3) and scaled by
+    // 0.4. The file's x, y and z are the earlier y, x and -z, with x shifted by half a unit. Computed with NumPy.
     let seen = [
         0.881017145,
         -0.159466323,
@@ -101,7 +101,7 @@ fn nerfstudios_world_is_left_by_its_transform() {
     document["camera_path"][0]["camera_to_world"] = json!(seen);
     let found = of(&document, Some(&json!({ "transform": transform, "scale": 0.4 })), applied).unwrap();
     close(&shots(found)[0].pose, &POSE);
-    // A file that was doubled: so are its places, and the scale has that in it.
+    // A file with doubled coordinates. Nerfstudio's scale includes the factor.
     let doubled = DAffine3 { matrix3: 2.0 * matrix3, translation: 2.0 * applied.translation };
     let found = of(&document, Some(&json!({ "transform": transform, "scale": 0.8 })), doubled).unwrap();
     close(&shots(found)[0].pose, &POSE);
@@ -118,7 +118,7 @@ fn nerfstudios_world_is_left_by_its_transform() {
 }
 
 #[test]
-fn key_frames_of_nerfstudio_are_gone_through() {
+fn read_nerfstudio_keys_pass_key_frames() {
     let matrix = |x: f64| [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
     let frame = |x: f64, seconds: f64| {
         json!({ "matrix": matrix(x), "fov": 50.0, "aspect": 1.5,
@@ -139,14 +139,14 @@ fn key_frames_of_nerfstudio_are_gone_through() {
     }
 }
 
-/// The same pose for instant-ngp and for the capture, by NumPy from what `nerf_loader.h` does.
+/// The same pose in the coordinates of instant-ngp and of the capture, computed with NumPy after `nerf_loader.h`.
 fn ngp_path() -> Value {
     let key = json!({ "R": [0.1, -0.3, 0.5, 0.8], "T": [0.7, 0.2, 1.1], "fov": 60.0, "dof": 0.0, "scale": 1.5, "slice": 0.0 });
     json!({ "time": 0.3, "path": [key, key, key] })
 }
 
 #[test]
-fn instant_ngps_cameras_are_taken_out_of_its_cube() {
+fn read_ngp_poses_leave_the_unit_cube() {
     let rows = |position: [f64; 3]| {
         let [x, y, z] = position;
         [
@@ -187,14 +187,14 @@ fn instant_ngps_cameras_are_taken_out_of_its_cube() {
         let Motion::Keys { path, .. } = of(&document, None, DAffine3::IDENTITY).unwrap().motion else { panic!() };
         path.shares()
     };
-    // Each time is that at which the next key frame is reached.
+    // Timestamps are arrival times of the next key frame.
     assert_eq!(times(false, [1.0, 4.0, 9.0]), [0.0, 0.25, 1.0]);
     assert_eq!(times(true, [1.0, 4.0, 8.0]), [0.0, 0.125, 0.5]);
     assert_eq!(times(false, [0.0, 0.0, 0.0]), [0.0, 0.5, 1.0]);
 }
 
 #[test]
-fn path_file_with_unknown_fields_is_refused() {
+fn read_unknown_fields_is_refused() {
     let fails = |mut document: Value, at: &str, value: Value, expected: &str| {
         let (parent, name) = at.rsplit_once('/').unwrap();
         let parent = document.pointer_mut(parent).unwrap();
