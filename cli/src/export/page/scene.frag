@@ -1,5 +1,5 @@
 #version 300 es
-// What raygrad's views show, a pixel at a time. What is written in capitals is put before this.
+// Renders one pixel as raygrad does. The script inserts definitions of the names in capitals before this.
 precision highp float;
 precision highp int;
 precision highp sampler2D;
@@ -26,7 +26,7 @@ const int SEEN4 = (OUT + DEGREE * DEGREE + 3) / 4, COLOR4 = (COLOR + 3) / 4;
 
 vec4 weight(int i) { return texelFetch(weights, ivec2(i & 1023, i >> 10), 0); }
 
-/// A place as one of the unit cube.
+/// Maps a position to the unit cube.
 vec3 cube(vec3 p) {
 #if SPACE == 0
   return (p - middle) * scale;
@@ -43,7 +43,7 @@ vec3 cube(vec3 p) {
 #endif
 }
 
-/// The features of a place, level by level.
+/// The hash grid features of a position, level by level.
 void encode(vec3 p, out vec4 x[IN4]) {
   p = clamp(p, 0.0, 1.0);
   for (int i = 0; i < IN4; i++) x[i] = vec4(0.0);
@@ -74,7 +74,7 @@ void encode(vec3 p, out vec4 x[IN4]) {
   }
 }
 
-/// The real spherical harmonics of a direction, as `SphericalHarmonics` has them.
+/// The real spherical harmonics of a direction, in the order of `SphericalHarmonics`.
 void harmonics(vec3 d, out float y[16]) {
   float x = d.x, w = d.y, z = d.z, zz = z * z, five = 5.0 * zz, apart = x * x - w * w;
   y[0] = 0.28209479177387814;
@@ -95,7 +95,7 @@ void harmonics(vec3 d, out float y[16]) {
   y[15] = -0.5900435899266435 * x * (x * x - 3.0 * w * w);
 }
 
-/// A layer without a bias: outputs of inputs, from the weights that begin at `first`.
+/// A layer without biases. Its weights start at `first`.
 #define LAYER(NAME, IN, OUTS) \
 void NAME(vec4 x[IN], int first, out vec4 y[OUTS]) { \
   for (int o = 0; o < OUTS; o++) { \
@@ -119,7 +119,7 @@ const int ADDED = SECOND + 4 * HIDDEN4 * OUT4;
 const int FIRST_COLOR = ADDED + 4 * COLOR4;
 const int NEXT_COLOR = FIRST_COLOR + 4 * SEEN4 * COLOR4;
 
-/// What the density network says of a place, of which the first is the logarithm of the density.
+/// The outputs of the density MLP at a position. The first one is the log density.
 void features(vec3 p, out vec4 f[OUT4]) {
   vec4 x[IN4];
   vec4 h[HIDDEN4];
@@ -157,7 +157,7 @@ void main() {
   vec2 at = (gl_FragCoord.xy - 0.5 * size) / focal;
   vec3 direction = normalize(turn * vec3(at, -1.0));
   vec3 inverse = 1.0 / mix(direction, vec3(1e-20), vec3(lessThan(abs(direction), vec3(1e-20))));
-  // Where the ray is in the box.
+  // Interval of the ray within the box.
   vec3 a = (low - eye) * inverse, b = (high - eye) * inverse;
   vec3 enter = min(a, b), leave = max(a, b);
   float near = max(max(enter.x, enter.y), max(enter.z, span.x));
@@ -190,7 +190,7 @@ void main() {
     ivec3 block = cell >> 2;
     uvec2 word = texelFetch(words, ivec3(block.xy, block.z + int(cascade) * (resolution >> 2)), 0).xy;
     if ((word.x | word.y) == 0u) {
-      // To the first step beyond the block.
+      // Skips the empty block, to the first step after it.
       vec3 side = vec3(block + ivec3(greaterThan(direction, vec3(0.0)))) * 4.0 / cells;
       vec3 faces = (((side - 0.5) * 2.0 * half3 * larger + centre) - eye) * inverse;
       float beyond = min(faces.x, min(faces.y, faces.z)) - start;
@@ -210,7 +210,7 @@ void main() {
     float weight = light * (1.0 - exp(-min(sigma * width, 1e4)));
     light *= exp(-min(sigma * width, 1e4));
     weightSum += weight;
-    // Small weights first come first served, within the budget.
+    // Samples with small weights get no colour query, within the budget.
     if (weight <= 0.0 || (uncolored + weight <= budget && 4.0 * weight <= budget)) uncolored += weight;
     else sum += weight * shade(f, harmonic);
     if (light <= termination) { ended = true; break; }

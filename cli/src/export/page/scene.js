@@ -1,11 +1,11 @@
-// A trained scene that renders itself; camera code comes before.
+// Scene page: renders a trained scene with WebGL. Runs after camera.js.
 "use strict";
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const stage = document.getElementById("stage"), picture = document.getElementById("picture"), status = document.getElementById("status");
 const sorry = document.getElementById("sorry");
 
-/** How long the graphics card may be busy with a piece of a picture, in milliseconds, and the first picture of a moving camera. */
+/** Target times in milliseconds: for a band of rows, and for the first render of a moving camera. */
 const PIECE = 40, FIRST = 30;
 const TABLE_WIDTH = 2048, TABLE_SHIFT = 11, WEIGHTS_WIDTH = 1024;
 
@@ -17,13 +17,13 @@ function bytes(name) {
 }
 bytes.files = JSON.parse(document.getElementById("files").textContent);
 
-/** Says what there is to say of a picture, or why there is none, which screen readers are to tell at once. */
+/** Shows the status, or an error, which screen readers announce at once. */
 function tell(words, sad = false) {
   [status.hidden, sorry.hidden] = [sad, !sad];
   (sad ? sorry : status).textContent = words;
 }
 
-// ---- the graphics card ------------------------------------------------------------------------------------------------
+// ---- WebGL ------------------------------------------------------------------------------------------------------------
 let gl = null, program = null, places = null;
 
 function texture(unit, target, make) {
@@ -37,14 +37,14 @@ function texture(unit, target, make) {
   return texture;
 }
 
-/** An array at least so long. */
+/** Pads an array to this length. */
 function padded(array, length) {
   const out = new array.constructor(length);
   out.set(array);
   return out;
 }
 
-/** What a shader says of each pixel. */
+/** A program that runs the fragment shader for each pixel. */
 function programOf(fragment) {
   const program = gl.createProgram();
   const corner = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }";
@@ -63,10 +63,10 @@ function programOf(fragment) {
   return program;
 }
 
-/** What is said beside each picture. */
+/** Warning after the status of each render. */
 let warning = "";
 
-/** Whether a pixel's loops end after some ten thousand rounds, as with llvmpipe, Mesa's stand-in for a card: rays have more. */
+/** Detects drivers that end loops after about 10000 rounds, such as llvmpipe of Mesa. Rays need more. */
 function endsLoopsEarly() {
   const program = programOf(`#version 300 es
 precision highp float;
@@ -102,7 +102,7 @@ function begin() {
   program = programOf([version, ...head, ...rest].join("\n"));
   places = (name) => gl.getUniformLocation(program, name);
 
-  // Rows of the table, four numbers to a texel, or fewer where a row has fewer.
+  // The hash table has up to four features per texel.
   const [format, inside] = each === 1 ? [gl.RED, gl.R16F] : each === 2 ? [gl.RG, gl.RG16F] : [gl.RGBA, gl.RGBA16F];
   const height = Math.ceil((grid.rows * texels) / TABLE_WIDTH);
   const blocks = march.resolution / 4;
@@ -140,7 +140,7 @@ function begin() {
   gl.enable(gl.SCISSOR_TEST);
 }
 
-/** Where a picture is made before it is shown. */
+/** The off-screen render target. */
 let target = null;
 function targetOf(width, height) {
   if (target && target.width === width && target.height === height) return target;
@@ -153,7 +153,7 @@ function targetOf(width, height) {
   return target;
 }
 
-/** Renders rows of a picture of this size, from below, and gives how long that took, in milliseconds. */
+/** Renders rows of an image of this size, counted from below. Returns the time in milliseconds. */
 async function rowsOf({ pose, fov }, width, height, from, count) {
   targetOf(width, height);
   gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
@@ -178,7 +178,7 @@ async function rowsOf({ pose, fov }, width, height, from, count) {
   return performance.now() - start;
 }
 
-/** Shows what was rendered. */
+/** Copies the render target to the canvas. */
 function show() {
   gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target.frame);
   gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
@@ -186,10 +186,10 @@ function show() {
   gl.blitFramebuffer(0, 0, target.width, target.height, 0, 0, picture.width, picture.height, gl.COLOR_BUFFER_BIT, gl.LINEAR);
 }
 
-// ---- pictures while the camera moves, and when it rests ----------------------------------------------------------------
-/** Rays a millisecond. */
+// ---- progressive rendering ---------------------------------------------------------------------------------------------
+/** Estimated rays per millisecond. */
 let rate = 500;
-/** The newest view that is wanted, and whether somebody is at work. */
+/** Number of the newest view, true while rendering, and number of the last complete view. */
 let wanted = 0, working = false, whole = -1;
 
 const free = () => {};
@@ -198,7 +198,7 @@ function ask() {
   if (!working) work();
 }
 
-/** A picture in pieces; whether it was still wanted at its end. */
+/** Renders an image in bands of rows. Returns false if a newer view cancelled it. */
 async function paint(seen, width, height, piece) {
   const own = wanted;
   let band = Math.max(1, Math.floor((rate * piece) / width)), spent = 0;
@@ -207,11 +207,11 @@ async function paint(seen, width, height, piece) {
     const took = Math.max(0.5, await rowsOf(seen, width, height, from, count));
     spent += took;
     from += count;
-    // Few more than before: they may show more.
+    // At most twofold growth, as later rows may be slower.
     band = clamp(Math.floor((count * piece) / took), 1, 2 * count);
     if (wanted !== own && piece === PIECE) return false;
   }
-  // Of the whole picture: where there is nothing, rays are quick.
+  // The rate of the whole image, since rays through empty space are fast.
   rate += 0.5 * ((width * height) / spent - rate);
   return true;
 }
@@ -225,7 +225,7 @@ async function work() {
       const [width, height] = [stage.clientWidth, stage.clientHeight].map((side) => Math.max(1, Math.round(side * share)));
       if (picture.width !== width || picture.height !== height) [picture.width, picture.height] = [width, height];
       const seen = { pose: rows(view), fov: view.fov };
-      // As large as there is time for.
+      // The largest size that fits the target time.
       const fits = Math.min(1, Math.sqrt((rate * FIRST) / (width * height)));
       const [w, h] = [width, height].map((side) => Math.max(1, Math.floor(side * fits)));
       await paint(seen, w, h, FIRST);
@@ -241,13 +241,13 @@ async function work() {
       stage.dataset.whole = String(whole);
     }
   } catch (error) {
-    // Of a card that is gone nothing else is to be said.
+    // The handler of the lost context has its own message.
     if (!gl.isContextLost()) tell(error.message, true);
   }
   working = false;
 }
 
-/** The bytes, RGBA row by row from above, of a picture of this size: for tests, and for programs. */
+/** RGBA bytes of a render, row by row from above: for tests and other programs. */
 async function render(pose, fov, width, height) {
   while (working) await new Promise((done) => setTimeout(done, 10));
   working = true;

@@ -1,5 +1,5 @@
-// Moving a camera about a scene. Places are in the scene's own units, with z upwards; a pose has the camera's right, up and
-// back as columns. What comes after this defines `free`, which is called before the camera moves, and `ask`, after.
+// Camera controls. Coordinates are in scene units, with z up. Columns of a pose are right, up, back and eye.
+// The page's script defines `free`, called before the camera moves, and `ask`, called after.
 "use strict";
 
 // ---- vectors ------------------------------------------------------------------------------------------------------
@@ -13,15 +13,15 @@ const unit = (a) => times(1 / (size(a) || 1), a);
 const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 const radians = Math.PI / 180;
 
-/** A vector turned about a unit axis. */
+/** Rotates a vector about a unit axis. */
 function turned(a, axis, angle) {
   const [c, s] = [Math.cos(angle), Math.sin(angle)];
   return add(add(times(c, a), times(s, cross(axis, a))), times((1 - c) * dot(axis, a), axis));
 }
 
-// ---- the camera -----------------------------------------------------------------------------------------------------
+// ---- camera ---------------------------------------------------------------------------------------------------------
 const view = { eye: [0, -4, 1], right: [1, 0, 0], up: [0, 0, 1], back: [0, -1, 0], pivot: [0, 0, 0], fov: 50, photograph: null };
-/** The corners of the scene's box, as soon as they are known. */
+/** The corners of the scene box, once known. */
 let bounds = null;
 
 const rows = (v) => [0, 1, 2].map((i) => [v.right[i], v.up[i], v.back[i], v.eye[i]]);
@@ -32,21 +32,21 @@ function place(pose, fov) {
   view.fov = fov;
 }
 
-/** The vertical field of view that shows in a window what one does in a picture of these proportions, both ways. */
+/** The vertical field of view at which a view of aspect ratio `own` fits into a window in both directions. */
 function fitting(fov, own, window) {
   const half = Math.tan(0.5 * fov * radians) * Math.max(1, own / window);
   return clamp((2 * Math.atan(half)) / radians, 1, 120);
 }
 
-/** Puts the camera where a scene is looked at from first, in a window of this shape. */
+/** Sets the initial camera for a window of this aspect ratio. */
 function enter({ pose, fov, proportion }, window) {
   place(pose, fitting(fov, proportion, window));
   view.pivot = times(0.5, add(...bounds));
-  // Whoever stands in the middle looks at what is around it.
+  // A camera at the centre looks outwards, so that the pivot is ahead of it.
   if (size(sub(view.eye, view.pivot)) < 0.05 * side()) view.pivot = sub(view.eye, times(0.5 * side(), view.back));
 }
 
-/** Makes the horizon level, as it is not in a photograph that was taken aslant; whoever looks along the vertical sees none. */
+/** Levels the horizon, which images taken at an angle need. Has no effect if the view is vertical. */
 function level() {
   const right = cross([0, 0, 1], view.back);
   if (Math.abs(view.right[2]) < 1e-9 || size(right) < 0.05) return;
@@ -62,7 +62,7 @@ function orbit(dx, dy) {
     view.eye = add(view.pivot, turned(sub(view.eye, view.pivot), axis, angle));
   };
   turn([0, 0, 1], -dx);
-  // Not over the poles, where left and right change places; from beyond only back.
+  // Not over the poles, where left and right swap. From beyond a pole, the camera may return.
   const height = Math.asin(clamp(view.back[2], -1, 1));
   const upright = view.up[2] > -1e-6;
   turn(view.right, upright ? -clamp(dy, Math.min(0, -1.5 - height), Math.max(0, 1.5 - height)) : -dy);
@@ -79,7 +79,7 @@ function pan(dx, dy) {
   ask();
 }
 
-/** How near the camera comes to what it turns about, as a share of the scene's side. */
+/** Smallest distance to the pivot, as a fraction of the scene's side. */
 const NEAREST = 0.02;
 
 function zoom(factor) {
@@ -88,7 +88,7 @@ function zoom(factor) {
   const backwards = size(away) > 0 ? unit(away) : view.back;
   const distance = Math.min(size(away) * factor, 100 * side());
   view.eye = add(view.pivot, times(distance, backwards));
-  // Whoever is as near as that pushes it along, and gets on.
+  // At this distance the pivot moves with the camera, so that zooming never stops.
   view.pivot = sub(view.eye, times(Math.max(distance, NEAREST * side()), backwards));
   ask();
 }
@@ -104,9 +104,9 @@ function fly(right, up, ahead) {
 
 const side = () => Math.max(...sub(bounds[1], bounds[0]));
 
-/** Lets pointers and the wheel move the camera. */
+/** Adds pointer and wheel controls. */
 function listen(stage) {
-  /** Pointers that are down, where they were last. */
+  /** Active pointers with their last positions. */
   const pointers = new Map();
   stage.addEventListener("pointerdown", (event) => {
     if (event.target.classList && event.target.classList.contains("handle")) return;
@@ -115,7 +115,7 @@ function listen(stage) {
   });
   stage.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
-    // Of three fingers the third does nothing.
+    // A third finger disables the gesture.
     if (!before || !bounds || pointers.size > 2) return;
     const area = stage.getBoundingClientRect();
     const [dx, dy] = [(event.clientX - before[0]) / area.height, (event.clientY - before[1]) / area.height];
@@ -140,7 +140,7 @@ function listen(stage) {
   }, { passive: false });
 }
 
-/** Moves the camera as a key says; says whether it does. */
+/** Moves the camera for a key; returns false for other keys. */
 function steer(event) {
   const step = 0.12;
   const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];

@@ -1,18 +1,18 @@
-// The page of `raygrad view`; camera.js comes before.
+// Page of `raygrad view`. Runs after camera.js.
 "use strict";
 
 const $ = (id) => document.getElementById(id);
 const stage = $("stage"), picture = $("picture"), photo = $("photo"), dots = $("dots"), marks = $("marks");
 
-// ---- what the program says ------------------------------------------------------------------------------------------
+// ---- messages from the server ---------------------------------------------------------------------------------------
 let about = null;
 let socket = null, attempts = 0;
-/** The picture that was asked for last, and the last that came. */
+/** Number of the last request, and the last render. */
 let asked = 0, shown = null;
 let training = null;
 
 let keys = [];
-/** Which playing of the path is under way; whatever moves the camera ends it. */
+/** Number of the current playback. Any camera motion increments it, which stops playback. */
 let playing = 0;
 
 function connect() {
@@ -25,7 +25,7 @@ function connect() {
   socket.onclose = (event) => {
     $("lost").textContent = training && training.ended ? "Training has ended and raygrad has exited. Open the run with raygrad view." : event.reason ? `raygrad closed the connection: ${event.reason}. Reconnecting…`
       : attempts < 3 ? "raygrad does not respond. Reconnecting…"
-      // Whether it refuses a link's token is not told.
+      // Browsers do not tell whether the server refused the token.
       : "raygrad does not respond. If it was restarted, open the new link that it printed. Reconnecting…";
     $("lost").hidden = false;
     attempts += 1;
@@ -45,7 +45,7 @@ function told(message) {
   else if (message.tell === "sorry") apologise(message.what);
 }
 
-/** What was asked for last is there, or cannot be. */
+/** The last request has its render or failed. */
 function answered() {
   unseen = null;
   if (again) ask();
@@ -75,17 +75,17 @@ function brought(data) {
   }
 }
 
-/** Photographs are found to have been taken elsewhere. */
+/** The cameras of the images have changed. */
 function moved(taken) {
   if (!about) return;
   Object.assign(about, taken);
   ask();
 }
 
-/** The scene, at first and after each time that the connection was lost. */
+/** Handles the description of the scene, after each connection. */
 function meet(message) {
   const before = about;
-  // Another program may be there by now, with another scene.
+  // After a reconnection, another program may serve another scene.
   const elsewhere = before === null || before.title !== message.title || String(bounds) !== String(message.bounds);
   const first = before === null || elsewhere;
   const checkpoint = before ? before.checkpoints[Number($("checkpoint").value)] : undefined;
@@ -114,7 +114,7 @@ function meet(message) {
   }
   for (const option of $("skip").options) option.disabled = about.training && !["", "off"].includes(option.value);
   $("video").disabled = about.training;
-  // Beyond the last checkpoint is what the run ended with.
+  // The position after the last checkpoint is the final model.
   const count = about.checkpoints.length, known = about.checkpoints.indexOf(checkpoint);
   const chosen = first || known < 0 ? count : known;
   document.querySelector("input[name=show][value=error]").disabled = about.photographs.length === 0;
@@ -130,16 +130,16 @@ function meet(message) {
   }
 }
 
-// ---- asking for pictures ----------------------------------------------------------------------------------------------
+// ---- requests for renders ---------------------------------------------------------------------------------------------
 let waits = false;
-/** Since when a view was asked for of which there is no picture yet, and whether the camera has moved since. */
+/** Time of the request without a render yet, and true if the camera has moved since. */
 let unseen = null, again = false;
-/** How long a picture is waited for before another is asked for, in milliseconds: else a hand that does not rest would see none. */
+/** Milliseconds to wait for a render before the next request. Without this limit, a moving camera would get no renders. */
 const PATIENCE = 1000;
-/** A number, or that it is none. */
+/** A number as text, or "-". */
 const digits = (x, count) => (typeof x === "number" ? x.toFixed(count) : "-");
 
-/** Asks for the picture of what is to be seen, at most once a frame of the display. */
+/** Requests a render of the current view, at most once per display frame. */
 function ask() {
   marksOf();
   if (waits || !about) return;
@@ -173,10 +173,10 @@ function wanted() {
   return answer;
 }
 
-/** What pictures show: of the error, colours that are compared. */
+/** The displayed quantity. The error mode compares colours. */
 const shows = () => (mode() === "error" ? { compared: true } : { show: mode() });
 const mode = () => document.querySelector("input[name=show]:checked").value;
-/** Width and height of pictures. */
+/** Width and height of renders. */
 function sizes() {
   const area = stage.getBoundingClientRect();
   const proportion = view.photograph === null ? area.width / area.height
@@ -189,7 +189,7 @@ function sizes() {
   return [clamp(Math.floor(height * proportion), 8, 4096), height];
 }
 
-/** Width and height of what key frames show, 1920 pixels at most. */
+/** Width and height of keyframes, at most 1920 pixels. */
 function freeSizes() {
   const photograph = view.photograph;
   view.photograph = null;
@@ -200,10 +200,10 @@ function freeSizes() {
 }
 const evenly = (sides) => sides.map((side) => Math.max(16, 2 * Math.round(side / 2)));
 
-/** The part of the stage that pictures fill. */
+/** The area of the stage that renders fill. */
 function frame() {
   const area = stage.getBoundingClientRect();
-  // Sides of coarse pictures are rounded up: they fill what the whole one will.
+  // Sides of coarse renders are rounded up. They fill the area of the full-size render.
   const whole = sizes(), coarse = shown && whole.map((side) => Math.ceil(side / 2 ** shown.halvings));
   const [width, height] = shown && String(shown.size) !== String(coarse) ? shown.size : whole;
   const share = Math.min(area.width / width, area.height / height);
@@ -215,7 +215,7 @@ let drawing = 0;
 async function draw(head, blob) {
   const turn = ++drawing;
   const bitmap = await createImageBitmap(blob).catch(() => null);
-  // One that was decoded faster has come before.
+  // A later render was decoded first.
   if (!bitmap || turn < (draw.last || 0)) return;
   draw.last = turn;
   const whole = head.halvings === 0;
@@ -245,7 +245,7 @@ function layout() {
   marksOf();
 }
 
-// ---- moving -------------------------------------------------------------------------------------------------------------
+// ---- camera motion ------------------------------------------------------------------------------------------------------
 function free() {
   playing += 1;
   if (view.photograph === null) return;
@@ -278,10 +278,10 @@ function settled() {
 
 const modes = ["color", "depth", "normals", "opacity", "error"];
 document.addEventListener("keydown", (event) => {
-  // What is typed among the controls is theirs.
+  // Keys belong to the focused control.
   if (!about || event.ctrlKey || event.metaKey || event.altKey || event.target.closest("aside")) return;
   const steered = steer(event);
-  // Held down, keys move the camera and do nothing else.
+  // Only camera keys repeat while they are held down.
   if (!steered && event.repeat) return;
   if (steered) { /* The camera has moved. */ }
   else if (event.key >= "1" && event.key <= "5") choose(modes[event.key - 1]);
@@ -303,7 +303,7 @@ function choose(name) {
   ask();
 }
 
-// ---- photographs ------------------------------------------------------------------------------------------------------------
+// ---- images -----------------------------------------------------------------------------------------------------------------
 let overlaid = null, requested = null;
 
 function goTo(number) {
@@ -319,7 +319,7 @@ function goTo(number) {
   settled();
 }
 
-/** What a camera looks at: as far as the middle of the scene, straight ahead. */
+/** The pivot of a camera: straight ahead, at the depth of the scene's centre. */
 function lookedAt({ eye, back }) {
   const middle = times(0.5, add(...bounds));
   return sub(eye, times(Math.max(0.05 * side(), dot(sub(eye, middle), back)), back));
@@ -359,27 +359,27 @@ async function overlay(number, blob) {
   blend();
 }
 
-// ---- marks over the picture -----------------------------------------------------------------------------------------------
-/** The part of the stage that pictures fill, while marks are made. */
+// ---- overlays -------------------------------------------------------------------------------------------------------------
+/** The area of the stage that renders fill, while overlays are drawn. */
 let area = null;
 
-/** What is nearer than this share of the scene's side is not marked. */
+/** Near plane of overlays, as a fraction of the scene's side. */
 const NEAR = 1e-3;
 const depthOf = (point) => -dot(sub(point, view.eye), view.back);
 
-/** Where a place is in the stage, or nothing if it is behind. */
+/** Projects a point to the stage; null for points behind the camera. */
 function project(point) {
   const local = sub(point, view.eye);
   const depth = depthOf(point);
   if (depth < NEAR * side()) return null;
   const { x, y, w, h } = area;
   const focal = (0.5 * h) / Math.tan(0.5 * view.fov * radians);
-  // How lenses bend light is left out of marks.
+  // Overlays ignore lens distortion.
   const [across, down] = view.photograph === null ? [0.5, 0.5] : about.photographs[view.photograph].centre;
   return [x + across * w + (focal * dot(local, view.right)) / depth, y + down * h - (focal * dot(local, view.up)) / depth];
 }
 
-/** Lines from each place to the next, none to or from where there is none, as far as they are before the camera. */
+/** SVG path of the segments between consecutive points, clipped to the near plane. A null point interrupts the path. */
 function path(points) {
   let text = "";
   const near = 1.01 * NEAR * side();
@@ -426,7 +426,7 @@ function marksOf() {
 function markAll() {
   const made = document.createDocumentFragment();
   area = frame();
-  // The error is seen from the nearest photograph, not from here.
+  // The error has the camera of the nearest image, so that overlays would not match.
   const here = !(mode() === "error" && view.photograph === null);
   if (here) makeMarks(made);
   marks.replaceChildren(made);
@@ -434,7 +434,7 @@ function markAll() {
   if (!dots.hidden) drawPoints();
 }
 
-/** Thousands of them, which as marks would take longer than a frame of the display. */
+/** Draws the points on a canvas, since thousands of SVG elements would be slow. */
 function drawPoints() {
   const room = stage.getBoundingClientRect();
   const fine = Math.min(devicePixelRatio, 2);
@@ -477,14 +477,14 @@ function makeBox() {
   });
 }
 
-/** Where sliders are at their ends, nothing is left out. */
+/** Slider ends stand for these bounds, so that nothing is cropped. */
 const EVERYWHERE = 1e9;
 function box() {
   const end = (i) => ["x", "y", "z"].map((name) => Number($(`box-${name}-${i}`).value));
   return [end(0), end(1)];
 }
 
-/** Moves a side of the box as far as the other. */
+/** Moves a face of the box, up to the opposite one. */
 function moveSide(axis, end, value) {
   const [moved, other] = [end, 1 - end].map((i) => $(`box-${"xyz"[axis]}-${i}`));
   moved.value = String((end ? Math.max : Math.min)(value, Number(other.value)));
@@ -500,7 +500,7 @@ function boxMarks(marks) {
     }
   }
   const middle = times(0.5, add(...ends));
-  // A finger is wider than a mouse's pointer.
+  // Fingers need larger handles.
   const r = matchMedia("(pointer: coarse)").matches ? 16 : 7;
   for (const axis of [0, 1, 2]) {
     for (const end of [0, 1]) {
@@ -515,7 +515,7 @@ function boxMarks(marks) {
   }
 }
 
-/** Moves a side of the box along its axis, as the pointer does in the picture. */
+/** Moves a face of the box along its axis with the pointer. */
 function dragFace(down, axis, end) {
   down.preventDefault();
   down.stopPropagation();
@@ -560,12 +560,12 @@ function listKeys() {
   remember();
 }
 
-/** The path through the key frames: a Catmull-Rom spline, to look at. */
+/** The path through the keyframes for display: a Catmull-Rom spline. */
 function flight(count) {
   const n = keys.length, closed = $("closed").checked;
   if (n < 2) return keys;
   const legs = closed ? n : n - 1;
-  // Beyond its ends a path goes straight on.
+  // Extrapolates linearly beyond the ends.
   const at = (i, name) => {
     if (closed) return keys[(i + n) % n][name];
     if (i < 0) return sub(times(2, keys[0][name]), keys[1][name]);
@@ -585,7 +585,7 @@ function flight(count) {
   });
 }
 
-/** How long the path takes. */
+/** Duration of the path in seconds. */
 const duration = () => clamp(Number($("seconds").value) || 4, 0.5, 600);
 
 function play() {
@@ -594,7 +594,7 @@ function play() {
   const seconds = duration(), start = performance.now(), turn = playing;
   const frames = flight(Math.ceil(60 * seconds));
   const next = (now) => {
-    // Something else moves the camera.
+    // Another camera motion has stopped the playback.
     if (turn !== playing) return;
     const share = (now - start) / 1000 / seconds;
     Object.assign(view, structuredClone(frames[Math.min(frames.length - 1, Math.floor(share * frames.length))]));
@@ -604,7 +604,7 @@ function play() {
   requestAnimationFrame(next);
 }
 
-/** A pose in the coordinates of the capture's files. */
+/** A pose in capture coordinates, row by row. */
 function inCapture(key) {
   const to = about.to_capture;
   const scale = Math.hypot(to[0][0], to[1][0], to[2][0]);
@@ -614,7 +614,7 @@ function inCapture(key) {
   return [0, 1, 2].flatMap((r) => [right[r], up[r], back[r], eye[r]]).concat([0, 0, 0, 1]);
 }
 
-/** A key frame of a pose in those coordinates. */
+/** A keyframe from a pose in capture coordinates. */
 function fromCapture({ matrix, fov }) {
   const to = about.to_capture;
   const scale = Math.hypot(to[0][0], to[1][0], to[2][0]);
@@ -625,7 +625,7 @@ function fromCapture({ matrix, fov }) {
   return { eye, right, up, back, fov, pivot: lookedAt({ eye, back }) };
 }
 
-/** What a path is loaded from again. */
+/** The saved form of a path. */
 const saved = () => ({
   coordinates: "capture",
   keyframes: keys.map((key) => ({ matrix: inCapture(key), fov: key.fov })),
@@ -633,10 +633,10 @@ const saved = () => ({
   seconds: duration(),
 });
 
-/** The most bytes and key frames that are loaded. */
+/** Limits of a path file: bytes and keyframes. */
 const LARGEST = 1e6, MOST_KEYS = 1000;
 
-/** Takes a path that was saved; says whether it is one. */
+/** Loads a saved path; returns false if it is invalid. */
 function take(path) {
   const among = (x, low, high) => typeof x === "number" && x >= low && x <= high;
   const isKey = (key) => {
@@ -660,7 +660,7 @@ async function loadPath(file) {
   marksOf();
 }
 
-/** By what name the path of this scene is remembered while the page is loaded again. */
+/** Key of the scene's path in the session storage. */
 const pathName = () => `path of ${about.title} in ${about.bounds}`;
 
 function remember() {
@@ -677,10 +677,10 @@ function recall() {
   } catch { /* Nothing is kept. */ }
 }
 
-/** The path in the form that `render` reads, if it is one. */
+/** The path for `raygrad render`, if it has two keyframes. */
 function cameraPath() {
   if (keys.length < 2) return apologise("A path needs two keyframes.");
-  // The picture's own proportions, in sides that encoders take.
+  // The aspect ratio of the view, with even sides for encoders.
   const [width, height] = evenly(freeSizes());
   return {
     ...saved(),
@@ -779,25 +779,25 @@ $("save-path").addEventListener("click", savePath);
 $("load-path").addEventListener("change", () => {
   const [file] = $("load-path").files;
   if (file) loadPath(file);
-  // The same one may be chosen again.
+  // Allows choosing the same file again.
   $("load-path").value = "";
 });
 $("video").addEventListener("click", makeVideo);
 $("end-video").addEventListener("click", () => say({ ask: "end-video" }));
 $("checkpoint").addEventListener("input", settled);
-// After a click the scene has the focus again; whoever moves by keys stays where they are.
+// Returns the focus to the scene after a click. Keyboard activation keeps it on the button.
 document.querySelector("aside").addEventListener("click", (event) => {
   if (event.detail && event.target.closest("button")) stage.focus({ preventScroll: true });
 });
 $("pause").addEventListener("click", () => say({ ask: "pause", pause: !(training && training.paused) }));
 $("stop").addEventListener("click", () => { if (confirm("Stop training and save the model?")) say({ ask: "stop" }); });
 $("share").addEventListener("input", () => say({ ask: "share", share: Number($("share").value) / 100 }));
-// Some browsers keep what was chosen before the page was loaded again.
+// Some browsers restore form values after a reload.
 for (const input of document.querySelectorAll("input")) [input.checked, input.value] = [input.defaultChecked, input.defaultValue];
-// What nobody sees need not be painted.
+// Stops rendering while the page is hidden.
 document.addEventListener("visibilitychange", () => {
   if (!document.hidden) return ask();
-  // The picture that was waited for does not come any more.
+  // The pending render will not arrive.
   unseen = null;
   say({ ask: "rest" });
 });

@@ -1,4 +1,4 @@
-// What each check begins with. Numbers agree to 1e-9, or as said; NaN agrees with nothing.
+// Helpers of all checks. Numbers agree within 1e-9 or the given tolerance; NaN agrees with nothing.
 const wrong = [];
 const alike = (a, b, within) => {
   if (typeof a === "number" && typeof b === "number") return a === b || Math.abs(a - b) <= within;
@@ -10,7 +10,7 @@ const is = (name, found, wanted, within = 1e-9) => {
   const words = (value) => String(JSON.stringify(value)).slice(0, 500);
   if (!alike(found, wanted, within)) wrong.push(`${name}: ${words(found)} in place of ${words(wanted)}`);
 };
-/** Stands in for some of the page's functions: what they are called with is kept. */
+/** Calls of replaced functions of the page. */
 const calls = [];
 const called = () => calls.splice(0);
 let clock = 1000;

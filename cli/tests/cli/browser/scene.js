@@ -1,4 +1,4 @@
-// The parts of an exported page, against numbers worked out by hand.
+// Unit tests of an exported page, with expected values by hand.
 const rest = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 while (working) await rest(5);
 const real = { rowsOf, paint, show };
@@ -8,7 +8,7 @@ fixed(stage, "clientHeight", 45);
 fixed(window, "devicePixelRatio", 1);
 is("padded", [...padded(new Uint16Array([1, 2]), 4)], [1, 2, 0, 0]);
 is("constants", [PIECE, FIRST, 1 << TABLE_SHIFT], [40, 30, TABLE_WIDTH]);
-// As many rows at once as there is time for.
+// All rows at once.
 is("how long that takes", await rowsOf({ pose: data.view.pose, fov: 50 }, 8, 6, 0, 6), 0);
 let each = () => 2;
 rowsOf = async (seen, width, height, from, count) => { calls.push([seen, width, height, from, count]); const took = each(count) * count; clock += took; return took; };
@@ -31,7 +31,7 @@ rate = 10;
 each = () => { wanted += 1; return 2; };
 is("not wanted any more", [await paint("v", 100, 50, PIECE), called().length, rate], [false, 1, 10]);
 is("a first picture is ended", [await paint("v", 100, 50, FIRST), called().length], [true, 5]);
-// First as large as there is time for, then whole.
+// First the size that fits the target time, then full size.
 let verdicts = [];
 paint = async (seen, width, height, piece) => { calls.push([seen, width, height, piece]); clock += 7; const verdict = verdicts.shift() ?? true; if (!verdict) wanted += 1; return verdict; };
 place(data.view.pose, 50);
@@ -63,12 +63,12 @@ is("an error", [told(), working], [[true, false, "given up"], false]);
 paint = painter;
 await turnTo();
 is("and none", [told().slice(0, 2), status.getAttribute("aria-live"), sorry.getAttribute("role")], [[false, true], "off", "alert"]);
-// Two at a time come after each other, and none is painted for the same view again.
+// Two requests render one after the other. A rendered view is not rendered again.
 ask();
 ask();
 while (working) await rest(1);
 is("newest", [called().length, whole === wanted], [4, true]);
-// Keys, and where it begins.
+// Keys, and the initial view.
 fixed(stage, "clientWidth", 45);
 fixed(stage, "clientHeight", 90);
 const fov = (2 * Math.atan(Math.tan(0.5 * data.view.fov * radians) * Math.max(1, 2 * data.view.proportion))) / radians;
@@ -88,7 +88,7 @@ data.view.pose = [[1, 0, 0, middle[0]], [0, 0, -1, middle[1]], [0, 1, 0, middle[
 reset();
 is("from the middle", view.pivot, [middle[0], middle[1] + side3 / 2, middle[2]]);
 while (working) await rest(1);
-// What a card has no room for, and what has been taken away, is said.
+// Errors: textures over the card's limits, and a lost context.
 const asks = gl.getParameter.bind(gl), limits = (table, cells) => {
   fixed(gl, "getParameter", (name) => (name === gl.MAX_TEXTURE_SIZE ? table : name === gl.MAX_3D_TEXTURE_SIZE ? cells : asks(name)));
   bytes.files = JSON.parse(document.getElementById("files").textContent);

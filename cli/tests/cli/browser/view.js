@@ -1,9 +1,9 @@
-// The parts of the page of `raygrad view`, against numbers worked out by hand. It has no program behind it from here on.
+// Unit tests of the page of `raygrad view`, with expected values by hand. The connection is closed first.
 socket.onclose = socket.onmessage = null;
 socket.close();
 const real = { ask, say, orbit, pan, zoom, fly, draw, overlay, keep };
 const S = Math.SQRT1_2;
-/** Timers, which run when they are told to. */
+/** Replaced timers, which tests run themselves. */
 const timers = [];
 let room = { x: 0, y: 0, width: 400, height: 200 };
 fixed(stage, "getBoundingClientRect", () => room);
@@ -13,8 +13,8 @@ fixed(window, "setTimeout", (run, after) => timers.push({ run, after }));
 say = (message) => { calls.push(message); };
 ask = () => { calls.push("ask"); };
 
-// ---- a scene of its own -----------------------------------------------------------------------------------------------
-/** From a place, looking along +y, -x and +y, in pictures of several shapes. */
+// ---- fake scene -------------------------------------------------------------------------------------------------------
+/** Poses at a position that look along +y. The images differ in direction and aspect ratio. */
 const along = ([x, y, z]) => [[1, 0, 0, x], [0, 0, -1, y], [0, 1, 0, z]];
 const photographs = () => [
   { name: "a", split: "test", pose: along([0, -4, 0]), fov: 40, size: [200, 100], centre: [0.5, 0.5] },
@@ -29,12 +29,12 @@ const scene = (changes) => ({
 });
 const eye = () => [view.eye, view.pivot];
 const axes = () => [view.right, view.up, view.back];
-/** At the origin, along +y. */
+/** Sets the camera at the origin, looking along +y. */
 const ahead = () => Object.assign(view, { eye: [0, 0, 0], right: [1, 0, 0], up: [0, 0, 1], back: [0, -1, 0], fov: 90, pivot: [0, 4, 0], photograph: null });
 const text = (id) => $(id).textContent;
 const set = (id, value) => { $(id)[typeof value === "boolean" ? "checked" : "value"] = value; };
 
-// ---- what is met --------------------------------------------------------------------------------------------------------
+// ---- description of the scene -------------------------------------------------------------------------------------------
 about = null;
 keys = [1];
 meet(scene());
@@ -50,7 +50,7 @@ is("offered", offered(), [false, true, false, false, false, false, false, false,
 is("sliders of the box", [...$("box").querySelectorAll("input")].map((i) => [i.id, i.min, i.max, i.value, i.getAttribute("aria-label")]), [
   ["box-x-0", "-1", "1", "-1", "lower x"], ["box-x-1", "-1", "1", "1", "upper x"], ["box-y-0", "-2", "2", "-2", "lower y"],
   ["box-y-1", "-2", "2", "2", "upper y"], ["box-z-0", "-3", "5", "-3", "lower z"], ["box-z-1", "-3", "5", "5", "upper z"]]);
-// Met again: what was chosen stays.
+// A second description keeps the user's choices.
 ahead();
 view.photograph = 2;
 set("checkpoint", 0);
@@ -81,7 +81,7 @@ told(scene({ bounds: [[-1, -2, -3], [1, 2, 3]] }));
 is("side", side(), 6);
 called();
 
-// ---- vectors and the camera ---------------------------------------------------------------------------------------------
+// ---- vectors and camera -------------------------------------------------------------------------------------------------
 is("turned", [turned([1, 0, 2], [0, 0, 1], Math.PI / 2), turned([0, 1, 0], [1, 0, 0], Math.PI / 2)], [[0, 1, 2], [0, 0, 1]]);
 is("vectors", [cross([1, 2, 3], [4, 5, 7]), dot([1, 2, 3], [4, 5, 7]), size([2, 3, 6]), unit([0, 0, 0]), clamp(3, 0, 2)], [[-1, 5, -3], 35, 7, [0, 0, 0], 2]);
 is("fitting", [fitting(90, 1, 2), fitting(90, 4, 1), fitting(60, 3, 2), fitting(0.1, 1, 1)], [90, 120, 81.78678929826181, 1]);
@@ -109,7 +109,7 @@ for (const by of [0.3, 2]) {
   orbit(0, by);
   is("orbit upside down", view.eye, [0, 4 - 4 * Math.cos(by), -4 * Math.sin(by)]);
 }
-// Aslant: level with the first turn, but not where nearly all is below.
+// A tilted camera is levelled by the first orbit, unless it looks almost straight down.
 ahead();
 [view.right, view.up] = [[0, 0, -1], [1, 0, 0]];
 orbit(0.5, 0);
@@ -217,7 +217,7 @@ say = (message) => { calls.push(message); };
 keys = [];
 listKeys();
 
-// ---- photographs ------------------------------------------------------------------------------------------------------------
+// ---- images -----------------------------------------------------------------------------------------------------------------
 const state = () => [view.eye, view.pivot, view.fov, view.photograph, $("photograph").value, $("fov").value, text("fov-out")];
 document.querySelector("input[value=error]").disabled = true;
 is("no error without photographs", [press("5"), mode()], [[true], "color"]);
@@ -250,7 +250,7 @@ view.eye = [4, 0.1, 0];
 view.back = [1, 0, 0];
 is("the nearest", step1("nearest"), 1);
 called();
-// Blending: goes to the nearest, asks for its photograph once, and shows it when it has come.
+// Blending moves to the nearest image, requests it once, and shows it when it arrives.
 const dot20 = document.createElement("canvas");
 [dot20.width, dot20.height] = [20, 10];
 const blob = await new Promise((done) => dot20.toBlob(done));
@@ -280,7 +280,7 @@ room = { x: 0, y: 0, width: 100, height: 200 };
 reset();
 const tall = (2 * Math.atan(2 * Math.tan(25 * radians))) / radians;
 is("reset in a tall window", [view.fov, view.pivot, $("fov").value, text("fov-out"), $("blend").value, photo.hidden], [tall, [0, 0, 0], "86", "86°", "0", true]);
-// Whoever stands in the middle looks at what is ahead, and comes nearer to it.
+// A camera at the centre has its pivot ahead, and zooms towards it.
 const begins = (height) => { about.pose = along([0, 0, height]); reset(); return view.pivot; };
 is("reset in the middle", [begins(0.31), begins(-0.29), (zoom(0.5), view.eye)], [[0, 0, 0], [0, 3, -0.29], [0, 1.5, -0.29]]);
 $("fov").value = 30;
@@ -329,7 +329,7 @@ shown = { size: [800, 200] };
 layout();
 is("a band", [frame(), ...[picture, photo].map(({ style }) => [style.left, style.top, style.width, style.height])], [{ x: 0, y: 50, w: 400, h: 100 }, ["0px", "50px", "400px", "100px"], ["0px", "50px", "400px", "100px"]]);
 
-// ---- what is asked for ------------------------------------------------------------------------------------------------------
+// ---- requests ---------------------------------------------------------------------------------------------------------------
 ahead();
 set("own-background", false);
 const free90 = { free: { pose: along([0, 0, 0]), fov: 90 } };
@@ -375,7 +375,7 @@ $("stop").click();
 $("end-video").click();
 is("stopped", called(), [{ ask: "stop" }, { ask: "end-video" }]);
 
-// ---- how often it is asked for ------------------------------------------------------------------------------------------------
+// ---- request rate -------------------------------------------------------------------------------------------------------------
 ask = real.ask;
 timers.length = 0;
 ahead();
@@ -416,7 +416,7 @@ is("seen", [timers.length, called()], [1, []]);
 timers.pop().run();
 ask = () => { calls.push("ask"); };
 
-// ---- what comes ---------------------------------------------------------------------------------------------------------------
+// ---- received messages --------------------------------------------------------------------------------------------------------
 const message = (head, bytes) => {
   const words = new TextEncoder().encode(JSON.stringify(head));
   const all = new Uint8Array(4 + words.length + bytes.length);
@@ -447,7 +447,7 @@ told({ tell: "video", file: "f.mp4", words: "3 of 9", ended: false });
 is("a video", [text("video-progress"), $("video-progress").hidden, $("end-video").hidden], ["f.mp4: 3 of 9", false, false]);
 told({ tell: "video", file: "f.mp4", words: "done", ended: true });
 is("its end", [text("video-progress"), $("end-video").hidden], ["f.mp4: done", true]);
-// Pictures: the newest stays, whichever was decoded first.
+// The newest render stays, whichever is decoded first.
 const coming = [];
 fixed(window, "createImageBitmap", () => new Promise((done) => coming.push(done)));
 const bitmap = (width, height) => { const canvas = document.createElement("canvas"); [canvas.width, canvas.height] = [width, height]; canvas.close = () => {}; return canvas; };
@@ -470,7 +470,7 @@ about.training = true;
 is("in training", await status({}), "30×15 · 13 ms · step 0");
 about.training = false;
 
-// ---- marks ----------------------------------------------------------------------------------------------------------------------
+// ---- overlays -------------------------------------------------------------------------------------------------------------------
 ahead();
 area = { x: 10, y: 5, w: 200, h: 100 };
 is("project", [project([1, 2, 0.5]), project([0, -1, 0]), project([0, 0.005, 0]), project([0, 0.007, 0])], [[135, 42.5], null, null, [110, 55]]);
@@ -542,7 +542,7 @@ const grip = (axis, end, [x, y]) => {
   dispatchEvent(new PointerEvent("pointermove", { clientX: 300, clientY: 300 }));
   return box()[end][axis];
 };
-// At a depth of 1.5, with a focal length of 100 pixels, a unit is 66.7 of them.
+// At a depth of 1.5 and a focal length of 100 pixels, a unit spans 66.7 pixels.
 is("moves a side", [grip(0, 1, [20, 7]), grip(0, 0, [-0.1, 0]), grip(2, 1, [5, 20]), grip(0, 0, [500, 0])], [0.3, -1, 2.7, 0.3], 1e-6);
 const drag = (id, value) => { set(id, value); $(id).dispatchEvent(new Event("input")); return Number($(id).value); };
 is("sides do not change places", [drag("box-y-0", 2), drag("box-y-0", 1), drag("box-y-1", -1), drag("box-y-1", 2)], [2, 1, 1, 2]);
@@ -588,7 +588,7 @@ is("of the error", sorry(() => { document.querySelector("input[value=error]").ch
 const three = keys;
 is("of many", sorry(() => { keys = Array.from({ length: 400 }, () => key([0.1, 1 / 3, 0])); }, () => { keys = three; }), ["Too many keyframes for the viewer: save the path and use raygrad render.", []]);
 is("of one", sorry(() => { keys = three.slice(0, 1); }, () => { keys = three; }), ["A path needs two keyframes.", []]);
-// A path that was saved comes back, with what each key frame looks at straight ahead; what is none leaves all as it is.
+// A saved path loads again, with pivots straight ahead. An invalid path changes nothing.
 const given = [key([0, -4, 0]), key([3, -5, 1], { right: [S, S, 0], back: [S, -S, 0], fov: 33 }), key([1, 1, 0.1], { right: [0.6, 0, 0.8], up: [-0.8, 0, 0.6] })];
 const back = [[0, 0, 0], [-1, -1, 1], [1, 1.3, 0.1]].map((pivot, i) => ({ ...given[i], pivot }));
 keys = given;
@@ -619,7 +619,7 @@ is("by its button", [called(), $("load-path").files.length], [["g.json"], 0]);
 $("load-path").dispatchEvent(new Event("change"));
 is("none is chosen", called(), []);
 loadPath = loader;
-// The path stays while the page is loaded again, and is that of its scene.
+// A path survives a reload of the page and belongs to its scene.
 const reload = (changes) => { about = null; meet(scene({ bounds: [[-1, -2, -3], [1, 2, 3]], ...changes })); return keys; };
 set("closed", true);
 $("closed").dispatchEvent(new Event("change"));
@@ -657,7 +657,7 @@ is("removed", [keys.map((key) => key.eye[0]), $("keys").children.length], [[0, 2
 $("key").click();
 is("added", [keys.length, keys[2], $("keys").children.length], [3, snapshot(), 3]);
 is("of its own", keys[2].eye === view.eye, false);
-// Playing, a frame of the display at a time.
+// Playback, one display frame at a time.
 let next = null;
 const frames = window.requestAnimationFrame;
 fixed(window, "requestAnimationFrame", (run) => { next = run; });
@@ -694,7 +694,7 @@ is("few points", curves(), [["M2.0 50.0L102.0 50.0", "loss 2.000"], [], ["M2.0 5
 told({ tell: "training", ...going, ended: "stopped" });
 is("ended", [text("progress"), ["pause", "stop", "share"].map((id) => $(id).disabled)], ["stopped after 12 steps", [true, true, true]]);
 
-// ---- the connection -----------------------------------------------------------------------------------------------------------------
+// ---- connection ---------------------------------------------------------------------------------------------------------------------
 const made = [];
 fixed(window, "WebSocket", class { static OPEN = 1; constructor(address) { made.push(String(address)); this.readyState = 0; } send(words) { calls.push(words); } });
 say = real.say;
