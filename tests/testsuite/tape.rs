@@ -398,7 +398,7 @@ fn nan_finder_checks_recorded_and_sparse_gradients() {
 }
 
 #[test]
-fn one_tape_gives_many_gradients_of_many_results() {
+fn tape_reused_gives_all_gradients() {
     let tape = Tape::new();
     let x = tape.leaf(vector(&[0.3, -1.2]));
     let h = x.sin() * &x;

@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn isosurface_lies_on_crossed_edges_facing_out() {
+    fn isosurface_on_crossed_edges_faces_out() {
         let middle = |edge: Edge| {
             let place = |axis: usize| if axis == edge.axis { 0.5 } else { (edge.corner >> axis & 1) as f64 };
             glam::DVec3::new(place(0), place(1), place(2))

@@ -134,7 +134,7 @@ function meet(message) {
 let waits = false;
 /** Time of the request without a render yet, and true if the camera has moved since. */
 let unseen = null, again = false;
-/** Milliseconds to wait for a render before the next request. Without this limit, a moving camera would get no renders. */
+/** Milliseconds to wait for a render before the next request. Without the wait, a moving camera would get no renders. */
 const PATIENCE = 1000;
 /** A number as text, or "-". */
 const digits = (x, count) => (typeof x === "number" ? x.toFixed(count) : "-");
