@@ -24,7 +24,7 @@ pub fn run_config() -> RunConfig {
     RunConfig {
         budget: None,
         keep_checkpoints: 2,
-        photographs: vec!["train/0".into()],
+        images: vec!["train/0".into()],
         raygrad: "0.1.0".into(),
         scene: Scene::Embedded,
         downscale: 1,

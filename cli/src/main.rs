@@ -60,7 +60,7 @@ Exit codes:
 
 /// Neural radiance fields on a CPU: images and camera poses in, new views out
 ///
-/// Without a command, raygrad trains on a built-in scene for about a minute and renders an image.
+/// Without a command, raygrad trains on a built-in scene for 45 seconds and renders an image.
 #[derive(Parser)]
 #[command(name = "raygrad", version, after_help = EXIT_CODES, term_width = 80)]
 struct Cli {

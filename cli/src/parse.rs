@@ -6,6 +6,7 @@ use std::ops::{RangeBounds, RangeInclusive};
 use std::str::FromStr;
 use std::time::Duration;
 
+use raygrad::nerf::Error;
 use serde_json::Value;
 
 /// Parses an integer from 1 to `most`.
@@ -28,6 +29,14 @@ where
             }
         })
     }
+}
+
+/// Parses a word of a list, such as a preset. The error is the list alone, since clap's own text has flag and value.
+pub fn word<T: FromStr<Err = Error>>(text: &str) -> Result<T, String> {
+    text.parse().map_err(|error: Error| match error {
+        Error::Setting { what, .. } => what.split_once("; ").map_or(what.clone(), |(_, remedy)| remedy.to_owned()),
+        error => error.to_string(),
+    })
 }
 
 /// Parses a duration such as `90s`, `10m` or `1.5h`.
@@ -120,6 +129,10 @@ pub fn weight(text: &str) -> Result<(String, f64), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use raygrad::nerf::dataset::{SceneType, Split};
+    use raygrad::nerf::model::RefinedParam;
+    use raygrad::nerf::space::occupancy::Skip;
+    use raygrad::nerf::{Background, Preset};
 
     #[test]
     fn count_and_within_parse_or_refuse() {
@@ -132,6 +145,21 @@ mod tests {
         assert_eq!(steps("18446744073709551615"), Ok(u64::MAX));
         assert_eq!(steps("0"), Err("write a whole number of at least 1".to_owned()));
         assert_eq!((count(3)("3"), count(3)("0").is_err(), count(3)("4").is_err()), (Ok(3), true, true));
+    }
+
+    #[test]
+    fn word_lists_the_words_in_its_error() {
+        assert_eq!(word::<Preset>("voxel"), Ok(Preset::Voxel));
+        assert_eq!(word::<Preset>("nerfacto"), Err("use classic, small, instant or voxel".to_owned()));
+        assert_eq!(word::<RefinedParam>("pose"), Err("use poses, focal, lens, exposure or vignetting".to_owned()));
+        for message in [
+            word::<Skip>("none").unwrap_err(),
+            word::<SceneType>("open").unwrap_err(),
+            word::<Split>("all").unwrap_err(),
+            word::<Background>("grey").unwrap_err(),
+        ] {
+            assert!(message.starts_with("use ") && message.contains(" or "), "{message}");
+        }
     }
 
     #[test]

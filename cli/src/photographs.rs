@@ -61,7 +61,7 @@ pub fn check_trained(run: &Run, capture: &Capture, views: &[&View], count: usize
     if count > 0 && views.len() != count {
         return bad(format!("has {} training images, and the run was trained on {count}", views.len()));
     }
-    let (names, is_made) = (&run.config.photographs, capture.present().next().is_none());
+    let (names, is_made) = (&run.config.images, capture.present().next().is_none());
     // Runs of the first version have no names, and names of built-in scenes differ.
     if !is_made && !names.is_empty() && !views.iter().map(|view| &view.name).eq(names) {
         return bad("has other training images than the run was trained on".to_owned());

@@ -79,9 +79,9 @@ pub struct Args {
     background: Option<[f32; 3]>,
     /// Empty-space skipping: off, near-lossless, fast
     ///
-    /// near-lossless changes a colour by at most 0.5 % of its range, fast by at most 5 %. By default rendering
+    /// near-lossless changes a colour by at most 0.6 % of its range, fast by at most 6 %. By default rendering
     /// skips as much as the run's config says.
-    #[arg(long, help_heading = "Advanced")]
+    #[arg(long, help_heading = "Advanced", value_parser = parse::word::<Skip>)]
     skip: Option<Skip>,
     /// Arithmetic: f32 or f64
     ///
@@ -106,12 +106,12 @@ pub struct Args {
 }
 
 impl Args {
-    /// Arguments for one image of a run, `picture.png` in its folder.
+    /// Arguments for one image of a run, `render.png` in its folder.
     pub fn picture(run: &Path) -> Self {
         Args {
             run: run.into(),
             flight: CameraPathArgs::default(),
-            out: Some(run.join("picture.png")),
+            out: Some(run.join("render.png")),
             show: Show::Color,
             save: vec![],
             depth_unit: None,

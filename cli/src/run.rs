@@ -54,8 +54,8 @@ pub struct RunConfig {
     /// Average training camera. Orbits start from it.
     pub viewpoint: Viewpoint,
     /// Names of the training images.
-    #[serde(default)]
-    pub photographs: Vec<String>,
+    #[serde(default, alias = "photographs")]
+    pub images: Vec<String>,
     /// Training budget. Runs of the first version have none.
     #[serde(default)]
     pub budget: Option<Budget>,
@@ -405,7 +405,7 @@ mod tests {
                 downscale: 2,
                 scene_box: SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.5, 4.0]),
                 viewpoint,
-                photographs: vec![],
+                images: vec![],
                 budget: Some(Budget::Steps(7)),
                 keep_checkpoints: 3,
                 config,

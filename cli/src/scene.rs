@@ -135,10 +135,25 @@ impl Opened {
                 )?
             }
         };
-        for name in &data.skipped {
-            complain(&format!("warning: {}: the {split} image `{name}` is missing and was skipped", self.scene));
+        if let Some(what) = missing(&data.skipped, data.frames.len()) {
+            complain(&format!("warning: {}: {what}", self.scene));
         }
         Ok(data)
+    }
+}
+
+/// Describes skipped images, of which at most three are named. `present` other images exist.
+fn missing(skipped: &[String], present: usize) -> Option<String> {
+    /// Names that are listed.
+    const NAMED: usize = 3;
+    let named = skipped.iter().take(NAMED).map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
+    match (skipped.len(), skipped.len() + present) {
+        (0, _) => None,
+        (1, all) => Some(format!("1 of {all} images is missing and was skipped: {named}")),
+        (count, all) => {
+            let rest = if count > NAMED { ", ..." } else { "" };
+            Some(format!("{count} of {all} images are missing and were skipped: {named}{rest}"))
+        }
     }
 }
 

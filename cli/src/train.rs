@@ -73,22 +73,22 @@ pub struct Args {
     /// and poses_bounds.npy (LLFF).
     #[arg(default_value = "embedded")]
     scene: Scene,
-    /// Kind of model
+    /// instant, voxel, small, classic
     ///
     /// instant: a hash grid, good within a minute. voxel: a dense grid without a network. small: a small MLP,
     /// minutes. classic: the networks of the NeRF paper, hours.
-    #[arg(long, help_heading = "Model", default_value_t)]
+    #[arg(long, help_heading = "Model", default_value_t, value_parser = parse::word::<Preset>)]
     preset: Preset,
     /// Empty-space skipping: off, near-lossless, fast
     ///
-    /// near-lossless changes a rendered colour by at most 0.5 % of its range, fast by at most 5 %. The default is
+    /// near-lossless changes a rendered colour by at most 0.6 % of its range, fast by at most 6 %. The default is
     /// fast for instant and voxel. small and classic sample hierarchically unless --skip is given.
-    #[arg(long, help_heading = "Model")]
+    #[arg(long, help_heading = "Model", value_parser = parse::word::<Skip>)]
     skip: Option<Skip>,
-    /// Images that must agree a cell is empty
+    /// Transparent images that empty a cell [default: 3]
     ///
     /// Visual hull carving: before training, cells become empty where at least N images are transparent. Of fewer
-    /// than 17 images, one in eight is enough. 0 trusts no mask. [default: 3]
+    /// than 17 images, one in eight is enough. 0 trusts no mask.
     #[arg(long, help_heading = "Scene", value_name = "N")]
     carve: Option<u32>,
     /// Training time: 90s, 10m or 1.5h
@@ -115,19 +115,19 @@ pub struct Args {
     /// bounded: an object in front of an empty background. unbounded: the images show the surroundings.
     /// forward-facing: unbounded, and all cameras look the same way. By default raygrad infers the type from images
     /// and cameras, and prints it with the reason.
-    #[arg(long, help_heading = "Scene", value_name = "TYPE")]
+    #[arg(long, help_heading = "Scene", value_name = "TYPE", value_parser = parse::word::<SceneType>)]
     scene_type: Option<SceneType>,
     /// Background: white, black or random
     ///
     /// Lies behind transparent images, and behind opaque ones too if given. The default for transparent images is
     /// random with instant and voxel, and white with small and classic.
-    #[arg(long, help_heading = "Scene", value_name = "COLOR")]
+    #[arg(long, help_heading = "Scene", value_name = "COLOR", value_parser = parse::word::<Background>)]
     background: Option<Background>,
     /// Refine poses,focal,lens,exposure,vignetting
     ///
     /// Optimizes the listed parameters together with the scene: camera poses, focal lengths, lens coefficients,
     /// per-image exposure and white balance, vignetting. Example: --refine poses,focal
-    #[arg(long, help_heading = "Model", value_name = "PARAMS", value_delimiter = ',')]
+    #[arg(long, help_heading = "Model", value_name = "PARAMS", value_delimiter = ',', value_parser = parse::word::<RefinedParam>)]
     refine: Vec<RefinedParam>,
     /// Fit measured depths
     ///
@@ -238,7 +238,7 @@ pub fn run(args: &Args) -> Result<Trained> {
 fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
     let mut scene = args.scene.open(args.scene_type)?;
-    scene.depth = args.depth_loss.is_some() || args.loss.iter().any(|(kind, weight)| kind == "depth" && *weight > 0.0);
+    scene.depth = args.has_depth_loss();
     warn_of_memory(&scene, args.downscale);
     let mut data = scene.load(Split::Train, args.downscale, usize::MAX)?;
     if let Some(near) = args.near {
@@ -271,7 +271,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     let [near, far] = extent.near_far;
     let data = Dataset { bounds: extent.bounds, near, far, transform: extent.transform, ndc: extent.ndc, ..data };
     let names = data.frames.iter().map(|frame| &frame.name);
-    if !names.eq(&run.config.photographs) {
+    if !names.eq(&run.config.images) {
         let what = format!(
             "the run was trained on other images than {} has now: restore those, or train a new run",
             run.config.scene

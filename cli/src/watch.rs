@@ -46,6 +46,8 @@ pub struct Watch<'a> {
     /// Last step to which a diverged run returned.
     back: Option<u64>,
     next_preview: f64,
+    /// The step of the last preview.
+    previewed: Option<u64>,
     /// Training time between saves in seconds.
     interval: f64,
     next_save: f64,
@@ -90,6 +92,7 @@ impl<'a> Watch<'a> {
             logged,
             back: None,
             next_preview: next_preview(train_seconds),
+            previewed: None,
             interval,
             next_save: train_seconds + interval,
             psnr: None,
@@ -264,8 +267,12 @@ impl<'a> Watch<'a> {
         logged
     }
 
+    /// Renders and writes a preview, once for each step.
     fn preview(&mut self, trainer: &Trainer) -> Result<()> {
         let stats = trainer.stats();
+        if self.previewed.replace(stats.step) == Some(stats.step) {
+            return Ok(());
+        }
         let folder = self.run.file("previews");
         let path = folder.join(format!("{:06}.png", stats.step));
         let (image, psnr) = self.preview.show(&trainer.model);
@@ -280,7 +287,8 @@ impl<'a> Watch<'a> {
         make_folder(&folder)?;
         write_atomic(&path, &png)?;
         let (time, name) = (spoken(stats.train_seconds), &self.preview.name);
-        self.progress.note(&format!("after {time}: {}, PSNR {psnr:.2} dB on {name}", path.display()));
+        let size = format!("{}x{}", image.width / 2, image.height);
+        self.progress.note(&format!("after {time}: {} ({size}), PSNR {psnr:.2} dB on {name}", path.display()));
         Ok(())
     }
 

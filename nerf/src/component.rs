@@ -215,8 +215,8 @@ impl<'de, F: ComponentType> Deserialize<'de> for AnyConfig<F> {
         let Some((_, read)) = all.iter().find(|(known, _)| *known == kind) else {
             let known: Vec<_> = all.iter().map(|(known, _)| *known).collect();
             let remedy = match known.join(", ") {
-                names if names.is_empty() => "read it as part of a whole `Config`, or call `register` first".to_owned(),
-                names => format!("use {names}, or call `register` first"),
+                names if names.is_empty() => "read it as part of a whole `Config`, or `register` it first".to_owned(),
+                names => format!("use {names}; a library user registers others with `register`"),
             };
             return Err(D::Error::custom(format!("unknown {} `{kind}`; {remedy}", F::WHAT)));
         };

@@ -343,7 +343,7 @@ fn doctor_finds_missing_parallax_and_gaps() {
 
     let mut planted = Planted::new();
     planted.capture.views.retain(|view| view.camera.pose.translation.y > 0.5);
-    found(&planted.cameras(), Kind::CoverageGap, Note, &[], &[Kind::FewPhotographs]);
+    found(&planted.cameras(), Kind::CoverageGap, Note, &[], &[Kind::FewImages]);
 
     let mut planted = Planted::new();
     planted.scope = Some(SceneType::Bounded);
@@ -360,13 +360,13 @@ fn doctor_finds_few_or_no_held_out_images() {
     planted.capture.views.retain(|view| view.split == Some(Split::Train));
     found(&planted.cameras(), Kind::NothingHeldOut, Note, &[], &[]);
     planted.capture.views.truncate(12);
-    found(&planted.cameras(), Kind::FewPhotographs, Warning, &[], &[]);
+    found(&planted.cameras(), Kind::FewImages, Warning, &[], &[]);
     planted.capture.views.truncate(4);
-    found(&planted.cameras(), Kind::FewPhotographs, Error, &[], &[]);
+    found(&planted.cameras(), Kind::FewImages, Error, &[], &[]);
     planted.capture.views.clear();
     let report = planted.report();
     assert!(report.facts.layout.is_none());
-    found(&report, Kind::FewPhotographs, Error, &[], &[]);
+    found(&report, Kind::FewImages, Error, &[], &[]);
 }
 
 #[test]

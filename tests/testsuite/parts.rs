@@ -177,7 +177,7 @@ fn custom_field_is_trained_rendered_saved_and_loaded() {
     let written = serde_json::to_value(&config).unwrap();
     assert_eq!(written["field"], serde_json::from_str::<serde_json::Value>(text).unwrap());
     let error = serde_json::from_value::<Config>(written).unwrap_err().to_string();
-    assert!(error.contains("unknown field `bare`; use classic, instant, voxel, or call `register` first"), "{error}");
+    assert!(error.contains("unknown field `bare`; use classic, instant, voxel; a library user"), "{error}");
     register::<Fields, BareConfig>();
     assert_eq!(read().unwrap(), config.field);
     assert!(read().unwrap() != FieldConfig::new(BareConfig { width: 9 }), "numbers count");

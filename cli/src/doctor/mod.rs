@@ -14,6 +14,7 @@ use raygrad::nerf::{Error, Result, write_atomic};
 
 use super::output::{complain, make_folder, print};
 use super::overwrite::{Job, png_with_text};
+use super::parse;
 use super::progress::Progress;
 use super::scene::{Opened, Scene};
 use serde_json::Value;
@@ -33,7 +34,7 @@ pub struct Args {
     /// bounded, unbounded or forward-facing
     ///
     /// By default raygrad infers the type from images and cameras.
-    #[arg(long, help_heading = "Scene", value_name = "TYPE")]
+    #[arg(long, help_heading = "Scene", value_name = "TYPE", value_parser = parse::word::<SceneType>)]
     pub scene_type: Option<SceneType>,
     /// Folder for cameras.png and doctor.html
     ///

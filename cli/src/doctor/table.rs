@@ -12,15 +12,11 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     let mut rows = vec![("format", facts.format.clone())];
     let parts = facts.subsets.iter().map(|CaptureSubset { split, present, absent }| match absent {
         0 => format!("{present} {split}"),
-        _ => format!("{present} {split} ({absent} absent)"),
+        _ => format!("{present} of {} {split}", present + absent),
     });
     rows.push(("images", joined(parts)));
-    let sizes = facts.resolutions.iter().map(|Resolution { width, height, photographs }| {
-        if facts.resolutions.len() == 1 {
-            format!("{width}x{height}")
-        } else {
-            format!("{width}x{height} ({photographs})")
-        }
+    let sizes = facts.resolutions.iter().map(|Resolution { width, height, images }| {
+        if facts.resolutions.len() == 1 { format!("{width}x{height}") } else { format!("{width}x{height} ({images})") }
     });
     rows.push(("resolution", joined(sizes)));
     rows.extend(facts.focal.map(|focal| ("focal length", format!("{} pixels", range(focal)))));

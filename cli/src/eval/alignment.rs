@@ -20,7 +20,7 @@ pub enum Alignment {
     #[serde(rename = "similarity of the training cameras")]
     Similarity,
     /// Each camera is fitted to the model, starting from one of the above.
-    #[serde(rename = "each fitted to its own photograph")]
+    #[serde(rename = "each fitted to its own image")]
     Fitted,
 }
 
@@ -63,10 +63,10 @@ pub enum Appearance {
     #[serde(rename = "none")]
     None,
     /// The mean over the training images of appearance embedding and exposure.
-    #[serde(rename = "mean of the training photographs")]
+    #[serde(rename = "mean of the training images")]
     Mean,
     /// The appearance of the image itself, for training images.
-    #[serde(rename = "each photograph's own")]
+    #[serde(rename = "each image's own")]
     Own,
     /// As [`Mean`](Self::Mean), with one gain per channel fitted to the left half. The right half is compared.
     #[serde(rename = "gains fitted to the left half, right half compared")]

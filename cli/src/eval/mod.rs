@@ -54,16 +54,16 @@ pub struct Args {
     #[arg(long, help_heading = "Scene")]
     scene: Option<Scene>,
     /// Split: train, val or test
-    #[arg(long, help_heading = "Scene", default_value = "test")]
+    #[arg(long, help_heading = "Scene", default_value = "test", value_parser = parse::word::<Split>)]
     split: Split,
     /// Use N evenly spaced views [default: all]
     #[arg(long, help_heading = "Scene", value_name = "N", value_parser = parse::within(1usize..))]
     views: Option<usize>,
     /// Empty-space skipping: off, near-lossless, fast
     ///
-    /// near-lossless changes a colour by at most about 0.5 % of its range, fast by at most 5 %. By default rendering
+    /// near-lossless changes a colour by at most 0.6 % of its range, fast by at most 6 %. By default rendering
     /// skips as much as the run's config says.
-    #[arg(long, help_heading = "Advanced")]
+    #[arg(long, help_heading = "Advanced", value_parser = parse::word::<Skip>)]
     skip: Option<Skip>,
     /// Align each camera to the model first
     ///
@@ -143,7 +143,7 @@ pub fn run(args: &Args) -> Result<()> {
     let opened = scene.open_for(&run.config.scene_box, run.config.config.unbounded)?;
     let mut data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
     if args.split != Split::Train
-        && let Some(frame) = data.frames.iter().find(|frame| run.config.photographs.contains(&frame.name))
+        && let Some(frame) = data.frames.iter().find(|frame| run.config.images.contains(&frame.name))
     {
         let what = format!(
             "the {} image `{}` was a training image of the run: name the unchanged capture with --scene",
@@ -157,7 +157,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
     // Vignetting is the same in all images, so renders have it too.
     model.vignetted = true;
-    let mut cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
+    let mut cameras = Alignment::apply(&model, &run.config.images, args.split, &mut data)?;
     if args.fit_poses {
         note("aligning cameras to the images");
         let found = fitted_cameras(&model, data.clone())?;
@@ -175,7 +175,7 @@ pub fn run(args: &Args) -> Result<()> {
     let _ = std::fs::remove_dir_all(&unfinished);
     make_folder(&unfinished)?;
     let own = |frame: &Frame| {
-        let number = run.config.photographs.iter().position(|name| *name == frame.name);
+        let number = run.config.images.iter().position(|name| *name == frame.name);
         number.filter(|_| appearance == Appearance::Own).map(|number| number as u32)
     };
     let looks = data.frames.iter().map(own).collect();

@@ -91,7 +91,7 @@ pub struct Identity {
     /// Version of raygrad for the training.
     pub raygrad: String,
     /// Number of training images.
-    pub photographs: usize,
+    pub images: usize,
     pub seed: u64,
     /// Training budget.
     pub budget: Option<Budget>,
@@ -105,14 +105,14 @@ impl Identity {
     pub fn of(run: &Run, model: &Model<f32>, crc32: String) -> Self {
         let metrics = std::fs::read_to_string(run.file("metrics.jsonl")).unwrap_or_default();
         let last = metrics.lines().rev().find_map(|line| serde_json::from_str::<StepStats>(line).ok());
-        let RunConfig { raygrad, photographs, budget, config, .. } = &run.config;
+        let RunConfig { raygrad, images, budget, config, .. } = &run.config;
         Identity {
             crc32,
             parameters: model.params.elements(),
             field: config.field.kind().to_owned(),
             sampler: config.sampler.kind().to_owned(),
             raygrad: raygrad.clone(),
-            photographs: photographs.len(),
+            images: images.len(),
             seed: config.seed,
             budget: *budget,
             steps: last.map(|stats| stats.step),

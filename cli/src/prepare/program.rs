@@ -111,7 +111,7 @@ impl Program {
 
     fn unusable(&self, error: &std::io::Error) -> Stop {
         let what = match error.kind() {
-            ErrorKind::NotFound => format!("is not on the PATH: install it with {}", self.install),
+            ErrorKind::NotFound => format!("is not on the PATH; install it with {}", self.install),
             _ => format!("cannot be run: {error}"),
         };
         Error::setting(self.name, what).into()

@@ -84,7 +84,7 @@ pub struct CameraPathArgs {
     /// Split of --keyframes [default: train]
     ///
     /// train, val or test.
-    #[arg(long, help_heading = "Camera")]
+    #[arg(long, help_heading = "Camera", value_parser = parse::word::<Split>)]
     split: Option<Split>,
     /// Close a spline to a loop
     #[arg(long, help_heading = "Camera")]

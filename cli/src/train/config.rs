@@ -29,14 +29,6 @@ impl Args {
             config = config.with_skip(skip);
         }
         config = config.with_scene_type(data.scene_type);
-        if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
-            let what = format!(
-                "{} spaces samples evenly, too few for the long rays of an unbounded scene: use instant or voxel, or \
-                 add --skip fast or --scene-type bounded",
-                self.preset
-            );
-            return Err(Error::setting("preset", what));
-        }
         if let Some(carve) = self.carve {
             let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
                 let what = format!("the preset {} has no occupancy grid to carve: add --skip fast", self.preset);
@@ -54,7 +46,24 @@ impl Args {
         if self.no_positional_encoding {
             config = config.without_positional_encoding();
         }
-        self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))
+        let config = self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))?;
+        if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
+            let what = "hierarchical sampling spaces samples evenly, too few for the long rays of an unbounded scene: \
+                        use --preset instant or voxel, or add --skip fast or --scene-type bounded";
+            return Err(Error::setting("preset", what));
+        }
+        Ok(config)
+    }
+
+    /// True if a depth loss is added, which needs measured depths.
+    pub fn has_depth_loss(&self) -> bool {
+        let is_depth = |term: &Value| term["kind"] == "depth";
+        let is_set = |(name, value): &(String, Value)| {
+            name == "loss_terms" && value.as_array().is_some_and(|terms| terms.iter().any(is_depth))
+        };
+        self.depth_loss.is_some()
+            || self.loss.iter().any(|(kind, weight)| kind == "depth" && *weight > 0.0)
+            || self.set.iter().any(is_set)
     }
 
     /// The record of a new run.
@@ -65,7 +74,7 @@ impl Args {
             downscale: self.downscale,
             scene_box: trainer.model.scene_box,
             viewpoint: Viewpoint::of(data),
-            photographs: data.frames.iter().map(|frame| frame.name.clone()).collect(),
+            images: data.frames.iter().map(|frame| frame.name.clone()).collect(),
             budget: Some(self.budget()),
             keep_checkpoints: self.keep_checkpoints.unwrap_or_else(usual_checkpoints),
             config: trainer.model.config.clone(),

@@ -134,7 +134,7 @@ fn eval_uses_the_models_cameras() {
     // Or with poses fitted to the images.
     place.succeeds("eval run --fit-poses --views 2");
     let fitted = place.json("run/eval-test-fast-2-poses.json");
-    assert_eq!(fitted["cameras"], "each fitted to its own photograph");
+    assert_eq!(fitted["cameras"], "each fitted to its own image");
     let psnr = |value: &Value| value["psnr_mean"].as_f64().unwrap();
     place.succeeds("eval run --views 2");
     assert!(psnr(&fitted) > psnr(&place.json("run/eval-test-fast-2.json")), "{fitted}");
@@ -158,7 +158,7 @@ fn eval_states_exposure_of_held_out_images() {
         r#"--set exposure_model={"exposure":{"constant":{"rate":0.05}},"vignetting":{"constant":{"rate":0.05}}}"#;
     place.succeeds(&format!("train scene --steps 12 --out run {SMALL} {fast}"));
     place.succeeds(&format!("train scene --steps 1 --out codes {SMALL} --set field.appearance_embedding_dim=2"));
-    for (run, expected) in [("plain", "none"), ("run", "mean of the training photographs")] {
+    for (run, expected) in [("plain", "none"), ("run", "mean of the training images")] {
         place.succeeds(&format!("eval {run}"));
         assert_eq!(place.json(&format!("{run}/eval-test-fast.json"))["appearance"], expected);
     }
@@ -191,7 +191,7 @@ fn eval_states_exposure_of_held_out_images() {
     assert!((psnr + 10.0 * mse.log10()).abs() < 0.05, "{psnr} {mse}");
     // Training images have their own exposure.
     place.succeeds("eval run --split train");
-    assert_eq!(place.json("run/eval-train-fast.json")["appearance"], "each photograph's own");
+    assert_eq!(place.json("run/eval-train-fast.json")["appearance"], "each image's own");
     let camera = &load(place.path("scene"), Split::Train, 1).unwrap().frames[0].camera;
     let shown = rendered(&place, "run/eval-train-fast");
     let usual = apart(&shown, &model.render(camera, [1.0; 3]).color);
@@ -243,8 +243,8 @@ fn opaque_images_have_plain_background() {
     // Samplers with uniform samples would miss an unbounded scene.
     place.fails_with(
         "train landscape --downscale 20 --steps 1 --preset small",
-        "`preset`: small spaces samples evenly, too few for the long rays of an unbounded scene: use instant or \
-         voxel, or add --skip fast or --scene-type bounded",
+        "`preset`: hierarchical sampling spaces samples evenly, too few for the long rays of an unbounded scene: use \
+         --preset instant or voxel, or add --skip fast or --scene-type bounded",
     );
     let marched = "--preset small --skip fast --set sampler.samples=512 --set sampler.occupancy.resolution=16";
     place.succeeds(&format!("train landscape --downscale 20 --steps 1 --out skipped {marched}"));
@@ -273,7 +273,7 @@ fn eval_of_training_images_as_test_is_an_error() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));
     let mut config = place.json("run/config.json");
-    config["photographs"] = json!([]);
+    config["images"] = json!([]);
     std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
     place.succeeds("render run --path spline --keyframes 0,3 --frames 2 --size 4x4");
     // A run without a refined camera for an image refuses it too.

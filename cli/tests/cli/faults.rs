@@ -139,7 +139,7 @@ fn faults_of_the_disk_lose_no_run() {
             let (output, calls) = traced(&place, Some(&fault), &begin());
             let said = String::from_utf8_lossy(&output.stderr).into_owned();
             assert!(!said.contains("panicked"), "{fault}: {said}");
-            let line = said.lines().find(|line| line.starts_with("raygrad: ") && !line.contains("few-photographs"));
+            let line = said.lines().find(|line| line.starts_with("raygrad: ") && !line.contains("few-images"));
             match (output.status.code(), line) {
                 (Some(0), Some(_)) => warned += 1,
                 // This run may have fewer calls.

@@ -261,7 +261,7 @@ fn run_is_complete_and_can_be_evaluated() {
 
     assert_eq!(printed["hold_out"], "as the capture's files say");
     let model = &printed["model"];
-    let fields = ["steps", "seed", "photographs", "field", "sampler", "raygrad"].map(|field| model[field].clone());
+    let fields = ["steps", "seed", "images", "field", "sampler", "raygrad"].map(|field| model[field].clone());
     assert_eq!(json!(fields), json!([3, 0, 6, "classic", "hierarchical", env!("CARGO_PKG_VERSION")]));
     let crc = crc32fast::hash(&place.bytes("run/model.safetensors"));
     assert!(model["crc32"] == format!("{crc:08x}") && model["budget"] == json!({ "steps": 3 }), "{model}");

@@ -118,7 +118,7 @@ fn transforms_paths_outside_are_never_written() {
     );
     // Names are kept; the first one is held out.
     assert_eq!(place.json("work/run/eval-test-fast.json")["per_view"][0]["name"], "../../x.png");
-    assert!(place.json("work/run/config.json")["photographs"].as_array().unwrap().contains(&json!("../masks/z.png")));
+    assert!(place.json("work/run/config.json")["images"].as_array().unwrap().contains(&json!("../masks/z.png")));
     // Blender's format has no masks.
     let mut plain = frames.clone();
     plain.iter_mut().for_each(|frame| drop(frame.as_object_mut().unwrap().remove("mask_path")));
@@ -138,7 +138,7 @@ fn transforms_paths_outside_are_never_written() {
     // A run whose configuration names images elsewhere is not resumed.
     write(&frames);
     let mut config = place.json("work/run/config.json");
-    config["photographs"][0] = json!("../../../x");
+    config["images"][0] = json!("../../../x");
     std::fs::write(place.path("work/run/config.json"), config.to_string()).unwrap();
     let output = place.command("train --resume run --steps 4").current_dir(place.path("work")).output().unwrap();
     super::complained("resume", &output, &["other images"]);

@@ -229,7 +229,7 @@ fn resume_needs_the_lock_and_the_training_images() {
     config["budget"] = Value::Null;
     std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
     place.fails_with("train --resume run", "`budget`: the run has none: add --budget or --steps");
-    config["photographs"][0] = "other".into();
+    config["images"][0] = "other".into();
     std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
     place.fails("train --resume run --steps 5", &["run: ", "other images"]);
 }

@@ -146,13 +146,11 @@ kinds! {
     /// Images are brighter or darker than their neighbours.
     ExposureJump = "exposure-jump", Warning,
         "the brightness of {} is far from that of neighbouring images",
-        "Capture with a fixed exposure. For the images as they are, train with appearance embeddings (`--set \
-         field.appearance_embedding_dim=8`).";
+        "Capture with a fixed exposure. For the images as they are, train with `--refine exposure`.";
     /// Images have another colour balance than their neighbours.
     WhiteBalanceJump = "white-balance-jump", Warning,
         "the colour balance of {} is far from that of neighbouring images",
-        "Capture with a fixed white balance. For the images as they are, train with appearance embeddings (`--set \
-         field.appearance_embedding_dim=8`).";
+        "Capture with a fixed white balance. For the images as they are, train with `--refine exposure`.";
     /// A camera is far from all others.
     FarCamera = "far-camera", Warning,
         "the camera of {} is far from all others",
@@ -162,7 +160,7 @@ kinds! {
         "no camera covers an angle of {} degrees around the centre",
         "Renders from there show parts that no image shows. Capture that side too if you need it.";
     /// The capture has few images.
-    FewPhotographs = "few-photographs", Warning,
+    FewImages = "few-images", Warning,
         "the capture has {}",
         "Capture 50 to 200 images that show each part of the scene at least three times. Fine detail and occlusion \
          need more.";
@@ -190,7 +188,7 @@ kinds! {
     /// Images have an alpha channel that is opaque everywhere.
     OpaqueAlpha = "opaque-alpha", Note,
         "the alpha channel of {} is opaque everywhere",
-        "raygrad takes the scene as unbounded. If it is an object before nothing, save the background with alpha 0.";
+        "Alpha then says nothing about the background. For an object on an empty background, save it with alpha 0.";
     /// Single images do not match their cameras.
     WrongPose = "wrong-pose", Warning,
         "cannot match {} with neighbouring images at the places that the poses predict",

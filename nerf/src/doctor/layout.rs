@@ -72,7 +72,7 @@ fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
         count => &format!("only {count} images"),
     };
     if views.len() < FEW[1] {
-        let finding = findings.add(Kind::FewPhotographs, &[&what]);
+        let finding = findings.add(Kind::FewImages, &[&what]);
         if views.len() < FEW[0] {
             finding.severity = Error;
         }

@@ -76,7 +76,7 @@ fn without_pixels(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &
     layout::examine(capture, survey, findings);
     let resolutions = pixels::sizes(capture, findings)
         .into_iter()
-        .map(|([width, height], photographs)| Resolution { width, height, photographs })
+        .map(|([width, height], images)| Resolution { width, height, images })
         .collect();
     let parts = Split::ALL.into_iter().map(|split| {
         let count = |exists: bool| {

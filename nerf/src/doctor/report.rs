@@ -41,7 +41,7 @@ pub struct Resolution {
     /// Height in pixels.
     pub height: usize,
     /// Number of images.
-    pub photographs: usize,
+    pub images: usize,
 }
 
 /// The images of one split.

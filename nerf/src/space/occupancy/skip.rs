@@ -30,7 +30,8 @@ impl Skip {
         }
     }
 
-    /// Returns the largest change of a colour, as a share of the range of colours: `1 - e^-max_depth`.
+    /// Returns the largest change of a colour by skipped cells, as a share of the range of colours:
+    /// `1 - e^-max_depth`. Early termination and the colour budget of [`Skipping`] add to it.
     pub fn error_bound(self) -> f64 {
         -(-self.max_depth()).exp_m1()
     }
