@@ -1,9 +1,9 @@
-//! Rules for the repository's Markdown files: line widths, sentence lengths, phrases, links and the summary of the
-//! book.
+//! Rules for the Markdown files of the repository: line widths, sentence lengths, phrases, links, commands, paths and the
+//! summary of the book.
 //!
 //! `cargo test --test testsuite documents -- --nocapture` prints the figures, also for comments of the sources.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fmt;
 use std::path::{Component, Path, PathBuf};
 
@@ -16,7 +16,9 @@ const BANNED: [&str; 8] =
     ["it is said", "is found out", "whoever", "is dear", "one's own", "as it lies", "goes on", "is asked for"];
 /// Generated pages of short facts.
 const GENERATED: [&str; 2] = ["docs/reference/commands.md", "docs/reference/config.md"];
-/// Abbreviations whose full stop does not end a sentence.
+/// First line of a checkpoint, which is no call of the program.
+const CHECKPOINT: &str = "raygrad checkpoint VERSION";
+/// Their full stop ends no sentence.
 const ABBREVIATIONS: [&str; 7] = ["al.", "e.g.", "i.e.", "vs.", "cf.", "Fig.", "No."];
 
 fn root() -> &'static Path {
@@ -45,6 +47,20 @@ fn files(extension: &str) -> Vec<PathBuf> {
     visit(root(), extension, &mut found);
     found.sort();
     found
+}
+
+/// The Markdown files of the repository.
+fn pages() -> Vec<PathBuf> {
+    let found = files("md");
+    assert!(!found.is_empty(), "no Markdown file is below {}", root().display());
+    found
+}
+
+/// The Markdown files that people write and that are of today: the changelog has names of earlier versions.
+fn current_pages() -> impl Iterator<Item = PathBuf> {
+    let is_current =
+        |file: &PathBuf| file != Path::new("CHANGELOG.md") && !GENERATED.iter().any(|page| file == Path::new(page));
+    pages().into_iter().filter(is_current)
 }
 
 fn read(file: &Path) -> String {
@@ -293,7 +309,108 @@ fn links(text: &str) -> Vec<(usize, String)> {
     all
 }
 
-/// The problem of a link, if any.
+/// Parts of a page in inline code, with their lines.
+fn inline_code(text: &str) -> Vec<(usize, String)> {
+    let others = lines(text).into_iter().enumerate().filter(|(_, (kind, _))| *kind != Kind::Code);
+    let parts = |(i, (_, line)): (usize, (Kind, &str))| {
+        line.split('`').skip(1).step_by(2).map(|code| (i + 1, code.to_owned())).collect::<Vec<_>>()
+    };
+    others.flat_map(parts).collect()
+}
+
+/// Lines of code blocks, with the number of their first line; those that end in a backslash go on.
+fn code_lines(text: &str) -> Vec<(usize, String)> {
+    let mut all: Vec<(usize, String)> = vec![];
+    let mut goes_on = false;
+    for (i, (kind, line)) in lines(text).into_iter().enumerate() {
+        if kind != Kind::Code {
+            goes_on = false;
+            continue;
+        }
+        let bare = line.trim_end_matches('\\');
+        match all.last_mut().filter(|_| goes_on) {
+            Some((_, whole)) => *whole += bare,
+            None => all.push((i + 1, bare.to_owned())),
+        }
+        goes_on = line.ends_with('\\');
+    }
+    all
+}
+
+/// The program's commands in a line of code: the words after `raygrad`, each up to the end of its command.
+fn program_calls(code: &str) -> Vec<Vec<&str>> {
+    let mut calls: Vec<Vec<&str>> = vec![];
+    let mut is_open = false;
+    if code.starts_with(CHECKPOINT) {
+        return calls;
+    }
+    let mut before = "";
+    for word in code.split_whitespace() {
+        let ends = ["|", "||", "&&", ";", ">", "2>", "#", "&", "\\"].contains(&word);
+        if word == "raygrad" && !["-p", "-n", "--bin", "add", "install", "cd", "use", "crate"].contains(&before) {
+            calls.push(vec![]);
+            is_open = true;
+        } else if ends {
+            is_open = false;
+        } else if is_open {
+            calls.last_mut().unwrap().push(word.trim_end_matches([',', ';', ')', '.', ':']));
+        }
+        before = word;
+    }
+    calls
+}
+
+/// The flags in a help text.
+fn flags(help: &str) -> HashSet<&str> {
+    let flag = |word: &str| word.len() - word.trim_start_matches(|c: char| c == '-' || c.is_ascii_alphanumeric()).len();
+    let words = help.split(|c: char| c.is_whitespace() || "[`'\"(".contains(c)).filter(|word| word.starts_with("--"));
+    words.map(|word| &word[..flag(word)]).collect()
+}
+
+/// What is wrong with a call of the program, if anything: its subcommand or a flag.
+fn check_call(call: &[&str]) -> Option<String> {
+    let help = |name: &str| std::fs::read_to_string(root().join(format!("cli/tests/help/{name}.txt"))).ok();
+    let is_name = |word: &&str| word.chars().all(|c| c.is_ascii_lowercase());
+    // Global flags may stand before it, with values.
+    let at = call.iter().position(|word| !word.starts_with("--") && word.parse::<usize>().is_err());
+    let name = at.map(|at| call[at]).filter(is_name);
+    let text = match name {
+        // `raygrad COMMAND`, `raygrad = ...`, or the program alone.
+        None if at.is_some() => return None,
+        None => help("raygrad")?,
+        Some("help") => return None,
+        Some(name) => match help(name) {
+            Some(text) => text,
+            None => return Some(format!("`raygrad {name}` is not a subcommand")),
+        },
+    };
+    let known = flags(&text);
+    let mut given = call.iter().filter(|word| word.starts_with("--")).map(|word| word.split('=').next().unwrap());
+    let wrong = given.find(|flag| !known.contains(flag) && *flag != "--")?;
+    Some(format!("`raygrad {}` has no {wrong}", name.unwrap_or_default()))
+}
+
+/// Folders whose files code in documents names by path from the root.
+const FOLDERS: [&str; 11] =
+    ["cli/", "nerf/", "tensor/", "autograd/", "scenes/", "tests/", "examples/", "benches/", "docs/", ".ci/", "src/"];
+/// Endings of files that may be named by the end of their path, such as `volume/rounds.rs`.
+const ENDINGS: [&str; 6] = [".rs", ".md", ".py", ".toml", ".js", ".sh"];
+
+/// The paths of files of the repository in a part of inline code.
+fn paths(code: &str) -> Vec<&str> {
+    let words = code.split_whitespace().map(|word| {
+        let word = word.trim_matches(['(', ')', ',', ';', '"', '\'']).trim_end_matches('.');
+        word.split([':', '#']).next().unwrap()
+    });
+    let is_path = |word: &&str| {
+        let is_plain = word.chars().all(|c| c.is_ascii_alphanumeric() || "/._-".contains(c));
+        let ends = word.contains('/') && ENDINGS.iter().any(|ending| word.ends_with(ending));
+        is_plain && (ends || FOLDERS.iter().any(|folder| word.starts_with(folder)))
+    };
+    words.filter(is_path).collect()
+}
+
+/// What is wrong with a link, if anything.
 fn check_link(file: &Path, target: &str) -> Option<String> {
     let (path, anchor) = target.split_once('#').map_or((target, None), |(path, anchor)| (path, Some(anchor)));
     let other = if path.is_empty() { file.to_path_buf() } else { normal(&file.with_file_name(path)) };
@@ -311,7 +428,7 @@ fn check_link(file: &Path, target: &str) -> Option<String> {
 #[test]
 fn documents_lines_fit_120_characters() {
     let mut findings = vec![];
-    for file in files("md") {
+    for file in pages() {
         for (i, (kind, line)) in lines(&read(&file)).into_iter().enumerate() {
             let width = line.chars().count();
             if kind != Kind::Code && width > WIDTH {
@@ -326,7 +443,7 @@ fn documents_lines_fit_120_characters() {
 fn documents_sentences_fit_30_words() {
     let (mut findings, mut each) = (vec![], vec![]);
     let (mut all, mut written, mut manual) = <(Lengths, Lengths, Lengths)>::default();
-    for file in files("md") {
+    for file in pages() {
         let mut own = Lengths::default();
         let is_manual = file == Path::new("README.md") || file.starts_with("docs");
         for (line, paragraph) in paragraphs(&read(&file)) {
@@ -353,7 +470,7 @@ fn documents_sentences_fit_30_words() {
 #[test]
 fn documents_have_no_banned_phrase() {
     let mut findings = vec![];
-    for file in files("md") {
+    for file in pages() {
         let text = read(&file);
         let others =
             lines(&text).into_iter().enumerate().filter(|(_, (k, _))| matches!(k, Kind::Table | Kind::Heading));
@@ -372,7 +489,7 @@ fn documents_have_no_banned_phrase() {
 #[test]
 fn documents_links_have_targets() {
     let (mut findings, mut count) = (vec![], 0);
-    for file in files("md") {
+    for file in pages() {
         for (line, target) in links(&read(&file)) {
             count += 1;
             findings.extend(check_link(&file, &target).map(|what| Finding { file: file.clone(), line, what }));
@@ -384,12 +501,45 @@ fn documents_links_have_targets() {
 }
 
 #[test]
+fn documents_commands_and_flags_exist() {
+    let (mut findings, mut count) = (vec![], 0);
+    for file in current_pages() {
+        let text = read(&file);
+        for (line, code) in inline_code(&text).into_iter().chain(code_lines(&text)) {
+            for call in program_calls(&code) {
+                count += 1;
+                findings.extend(check_call(&call).map(|what| Finding { file: file.clone(), line, what }));
+            }
+        }
+    }
+    println!("{count} calls of the program");
+    assert_none("commands in documents are those of `raygrad --help`", &findings);
+    assert!(count > 100, "{count}");
+}
+
+#[test]
+fn documents_paths_in_code_exist() {
+    let all: Vec<PathBuf> = ENDINGS.iter().flat_map(|ending| files(&ending[1..])).collect();
+    let (mut findings, mut count) = (vec![], 0);
+    for file in current_pages() {
+        for (line, code) in inline_code(&read(&file)) {
+            for path in paths(&code) {
+                count += 1;
+                let exists = root().join(path).exists() || all.iter().any(|own| own.ends_with(path));
+                if !exists {
+                    findings.push(Finding { file: file.clone(), line, what: format!("there is no {path}") });
+                }
+            }
+        }
+    }
+    println!("{count} paths");
+    assert_none("paths in inline code exist", &findings);
+    assert!(count > 100, "{count}");
+}
+
+#[test]
 fn documents_are_all_in_the_summary() {
     let summary = Path::new("docs/SUMMARY.md");
-    if !root().join(summary).exists() {
-        eprintln!("skipped: there is no docs/SUMMARY.md yet");
-        return;
-    }
     let text = read(summary);
     let entries: Vec<(usize, PathBuf)> =
         links(&text).into_iter().map(|(line, target)| (line, normal(&summary.with_file_name(target)))).collect();
@@ -403,7 +553,7 @@ fn documents_are_all_in_the_summary() {
             add(*line, format!("{} is in it twice", entry.display()));
         }
     }
-    for page in files("md").into_iter().filter(|file| file.starts_with("docs") && file != summary) {
+    for page in pages().into_iter().filter(|file| file.starts_with("docs") && file != summary) {
         if !entries.iter().any(|(_, entry)| *entry == page) {
             add(1, format!("{} is not in it", page.display()));
         }
@@ -459,4 +609,22 @@ fn documents_parser_finds_sentences_and_anchors() {
     assert_eq!(banned("The scene Goes on; it goes once.").collect::<Vec<_>>(), ["goes on"]);
     assert!(check_link(Path::new("README.md"), "no/such.md").is_some());
     assert_eq!(check_link(Path::new("docs/x.md"), "../Cargo.toml"), None);
+    // Calls of the program.
+    let calls = program_calls("cargo run -p raygrad # raygrad x\n");
+    assert!(calls.iter().all(|call| call == &["x"]), "{calls:?}");
+    assert_eq!(
+        program_calls("A=1 raygrad train x --steps 5 | raygrad eval"),
+        [vec!["train", "x", "--steps", "5"], vec!["eval"]]
+    );
+    let said = |code: &str| program_calls(code).iter().find_map(|call| check_call(call));
+    for right in ["raygrad", "raygrad --threads 2 train --view", "raygrad export R x.html", "raygrad = { path }"] {
+        assert_eq!(said(right), None, "{right}");
+    }
+    assert_eq!(said("raygrad fly").unwrap(), "`raygrad fly` is not a subcommand");
+    assert_eq!(said("raygrad train x --step=5").unwrap(), "`raygrad train` has no --step");
+    assert_eq!(said("raygrad --thread 5").unwrap(), "`raygrad ` has no --thread");
+    let text = "a `b c` d `e`\n\n```sh\nraygrad train \\\n  --step 5\nx\n```\n";
+    assert_eq!(inline_code(text), [(1, "b c".to_owned()), (1, "e".to_owned())]);
+    assert_eq!(code_lines(text)[1..3], [(4, "raygrad train   --step 5".to_owned()), (6, "x".to_owned())]);
+    assert_eq!(paths("cargo x a/b.rs:5 (cli/src) c.rs x/*.rs http://y.md/a.md"), ["a/b.rs", "cli/src"]);
 }
