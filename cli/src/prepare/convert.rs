@@ -49,7 +49,22 @@ impl Target {
         matches!(self, Target::Llff | Target::Blender)
     }
 
-    /// File name and view name of an image in a folder of this format. `inner` is its path within the image folder.
+    /// Whether the format has masks.
+    fn has_masks(self) -> bool {
+        self != Target::Llff
+    }
+
+    /// Whether the format has measured depths.
+    fn has_depths(self) -> bool {
+        self == Target::Nerfstudio
+    }
+
+    /// Whether the format stores which images are held out.
+    fn has_splits(self) -> bool {
+        matches!(self, Target::Nerfstudio | Target::Blender)
+    }
+
+    /// Where in a folder of this format an image is, and what its view is called. `inner` is its path among the images.
     fn place(self, inner: &str, rest: &str, split: Option<Split>) -> (String, String) {
         let flat = |name: &str| name.replace('/', "_");
         match self {
@@ -162,23 +177,34 @@ fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
     print(&format!("scene    {}: {}\n", out.display(), parts.join(", ")))
 }
 
-/// The job of each image.
+/// Warnings about masks, depth files and splits that the new dataset does not have.
+fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
+    let count = |has: fn(&View) -> bool| capture.views.iter().filter(|view| has(view)).count();
+    let masks = count(|view| view.mask.is_some());
+    let depths = count(|view| view.depth.is_some());
+    let held_out = count(|view| view.split.is_some_and(|split| split != Split::Train));
+    let mut warnings = vec![];
+    if masks > 0 && !target.has_masks() {
+        warnings.push(format!("{masks} masks are not converted: LLFF has none"));
+    }
+    if depths > 0 && !target.has_depths() {
+        warnings.push(format!("{depths} depth files are not converted: the format has none"));
+    } else if depths > 0 && undistorted {
+        warnings.push(format!("{depths} depth files are not converted: --undistort does not change them"));
+    }
+    if held_out > 0 && !target.has_splits() {
+        warnings.push(format!(
+            "{held_out} held-out images lose their split, which the format cannot store: readers hold out others, \
+             such as every eighth"
+        ));
+    }
+    warnings
+}
+
+/// What is to be done with each photograph.
 fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> Result<Vec<Job>> {
-    let has_masks = target != Target::Llff;
-    let has_depths = target == Target::Nerfstudio && !undistorted;
-    let warn = |count: usize, what: &str| {
-        if count > 0 {
-            complain(&format!("warning: {}: {count} {what}", capture.folder.display()));
-        }
-    };
-    if !has_masks {
-        warn(capture.views.iter().filter(|view| view.mask.is_some()).count(), "masks are not converted: LLFF has none");
-    }
-    if !has_depths {
-        let why = if undistorted { "--undistort does not change them" } else { "the format has none" };
-        let count = capture.views.iter().filter(|view| view.depth.is_some()).count();
-        warn(count, &format!("depth files are not converted: {why}"));
-    }
+    let has_masks = target.has_masks();
+    let has_depths = target.has_depths() && !undistorted;
     let mut taken = HashSet::new();
     let mut jobs = vec![];
     for view in &capture.views {
@@ -200,12 +226,8 @@ fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> 
         });
         jobs.push(Job { from: view.clone(), to, seen_by: None });
     }
-    if matches!(target, Target::Colmap | Target::Llff) {
-        let held_out =
-            capture.views.iter().filter(|view| view.split.is_some_and(|split| split != Split::Train)).count();
-        let why = "held-out images lose their split, which the format cannot store: readers hold out others, such as \
-                   every eighth";
-        warn(held_out, why);
+    for what in lost(capture, target, undistorted) {
+        complain(&format!("warning: {}: {what}", capture.folder.display()));
     }
     Ok(jobs)
 }
@@ -287,6 +309,7 @@ fn make_parent(path: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::DAffine3;
 
     #[test]
     fn place_follows_the_target_format() {
@@ -305,5 +328,37 @@ mod tests {
         ] {
             assert_eq!(of(target, rest), pair(image, name), "{rest} {target:?}");
         }
+    }
+    #[test]
+    fn lost_parts_are_named_for_each_format() {
+        let view = |split| View {
+            split,
+            ..View::new("0.png", "frames[0]", Camera::from_angle(4, 3, 1.0, DAffine3::IDENTITY))
+        };
+        let mut views: Vec<View> =
+            [Some(Split::Train), Some(Split::Val), Some(Split::Test), Some(Split::Test), None].map(view).into();
+        views[0].mask = Some("mask.png".into());
+        (views[1].depth, views[2].depth) = (Some(("1.npy".into(), 1.0)), Some(("2.npy".into(), 1.0)));
+        let capture = Capture::new(Path::new("scene"), "scene/transforms.json".into(), Format::Transforms, views);
+        let masks = "1 masks are not converted: LLFF has none";
+        let depths = "2 depth files are not converted: the format has none";
+        let split = "3 held-out images lose their split, which the format cannot store: readers hold out others, such \
+                     as every eighth";
+        for (target, expected) in [
+            (Target::Nerfstudio, vec![]),
+            (Target::Blender, vec![depths]),
+            (Target::Colmap, vec![depths, split]),
+            (Target::ColmapText, vec![depths, split]),
+            (Target::Llff, vec![masks, depths, split]),
+        ] {
+            assert_eq!(lost(&capture, target, false), expected, "{target:?}");
+            let undistorted = match target {
+                Target::Nerfstudio => vec!["2 depth files are not converted: --undistort does not change them"],
+                _ => expected,
+            };
+            assert_eq!(lost(&capture, target, true), undistorted, "{target:?} undistorted");
+        }
+        let capture = Capture { views: vec![view(Some(Split::Train)), view(None)], ..capture };
+        assert_eq!(lost(&capture, Target::Llff, false), Vec::<String>::new());
     }
 }
