@@ -31,9 +31,7 @@ use config::set_near;
 #[cfg(test)]
 pub use config::changed;
 
-/// Assumed free memory in bytes if the system does not report it.
-const HEAVY: f64 = 4e9;
-/// Most returns of a diverged run to a checkpoint.
+/// How often a run that has diverged goes back to its last checkpoint.
 const RETREATS: u32 = 3;
 /// End of the message for a run that has used up its budget.
 const FINISHED: &str = ", the end of its budget: add --steps or --budget with a larger total to train on";
@@ -211,7 +209,12 @@ pub struct Trained {
 }
 
 impl Trained {
-    /// The exit code of the program.
+    /// Whether training came to the end of its budget.
+    pub fn is_complete(&self) -> bool {
+        !self.interrupted && !self.diverged
+    }
+
+    /// With which code the program should exit.
     pub fn exit_code(&self) -> ExitCode {
         match self {
             Trained { interrupted: true, .. } => interrupt::EXIT_CODE.into(),
@@ -361,22 +364,12 @@ fn train(
     Ok(Trained { folder: run.folder, interrupted, diverged: diverged.is_some() })
 }
 
-/// Warns before loading if the images need more memory than is free.
+/// Warns before images are read that need more memory than is free.
 fn warn_of_memory(scene: &Opened, downscale: usize) {
     let Some((capture, _)) = &scene.capture else { return };
-    let pixels: f64 = capture.present().map(|view| view.camera.width as f64 * view.camera.height as f64).sum();
-    let bytes = |downscale: usize| 3.0 * pixels / (downscale * downscale) as f64;
-    let free = memory::available().unwrap_or(HEAVY);
-    if bytes(downscale) > free {
-        let enough = (downscale..1 << 14).find(|k| bytes(*k) <= 0.5 * free).unwrap_or(downscale);
-        complain(&format!(
-            "warning: {} images need about {:.1} GB of memory, but {:.1} GB are free: --downscale {enough} needs \
-             {:.1} GB",
-            capture.present().count(),
-            bytes(downscale) / 1e9,
-            free / 1e9,
-            bytes(enough) / 1e9
-        ));
+    let pixels = capture.present().map(|view| view.camera.width as f64 * view.camera.height as f64).sum();
+    if let Some(warning) = memory::image_shortage(capture.present().count(), pixels, downscale, memory::available()) {
+        complain(&warning);
     }
 }
 
