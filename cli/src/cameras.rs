@@ -171,7 +171,57 @@ mod tests {
     }
 
     #[test]
-    fn viewpoint_one_sided_has_azimuth_and_reach() {
+    fn mean_camera_equals_values_by_hand() {
+        // Around (1, 2, 3): above, above and below it.
+        let offsets = [DVec3::new(3.0, 0.0, 4.0), DVec3::new(0.0, -12.0, 5.0), DVec3::new(-8.0, 0.0, -6.0)];
+        let mut data = embedded(Split::Test, 8);
+        data.bounds = [DVec3::ZERO, DVec3::new(2.0, 4.0, 6.0)];
+        data.frames.truncate(3);
+        for (frame, offset) in data.frames.iter_mut().zip(offsets) {
+            let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0) + offset, DVec3::new(1.0, 2.0, 3.0), DVec3::Z);
+            frame.camera = Camera { focal: [50.0, 25.0], ..Camera::from_angle(40, 30, 1.0, pose) };
+        }
+        let view = Viewpoint::of(&data);
+        assert_eq!([view.width, view.height], [40, 30]);
+        // 2 atan(20 / 50); (5 + 13 + 10) / 3; the mean of asin(4 / 5), asin(5 / 13) and -asin(3 / 5). All stand in the
+        // half of the circle about -y.
+        for (name, value, expected) in [
+            ("angle_x", view.angle_x, 0.761_012_754_224_729_8),
+            ("distance", view.distance, 9.333_333_333_333_334),
+            ("elevation", view.elevation, 0.226_195_076_302_696_43),
+            ("azimuth", view.azimuth, 1.5 * PI),
+            ("reach", view.reach, 0.5 * PI),
+        ] {
+            assert!((value - expected).abs() < 1e-12, "{name}: {value} {expected}");
+        }
+        let up = data.frames[0].camera.pose.translation + DVec3::Z;
+        data.bounds = [up - DVec3::new(1.0, 1.0, 9.0), up + DVec3::new(1.0, 1.0, -7.0)];
+        data.frames.truncate(1);
+        assert!((Viewpoint::of(&data).elevation - 1.470_796_326_794_896_6).abs() < 1e-9, "0.1 from the pole");
+    }
+
+    #[test]
+    fn orbit_cameras_equal_values_by_hand() {
+        let (angle_x, elevation) = (0.761_012_754_224_729_8, 0.643_501_108_793_284_4);
+        let view = Viewpoint { width: 40, height: 30, angle_x, distance: 10.0, elevation, azimuth: 0.0, reach: PI };
+        let extent = SceneBox::new([DVec3::ZERO, DVec3::new(2.0, 4.0, 6.0)], [0.5, 9.0]);
+        let cameras = view.orbit(&extent, 4);
+        let eyes = [[9.0, 2.0, 9.0], [1.0, 10.0, 9.0], [-7.0, 2.0, 9.0], [1.0, -6.0, 9.0]];
+        assert_eq!(cameras.len(), 4);
+        for (camera, eye) in cameras.iter().zip(eyes) {
+            assert!(camera.pose.translation.distance(eye.into()) < 1e-12, "{camera:?}");
+            assert_eq!(([camera.width, camera.height], camera.centre), ([40, 30], [20.0, 15.0]));
+            assert!(camera.focal.iter().all(|focal| (focal - 50.0).abs() < 1e-9), "{camera:?}");
+            let look = (DVec3::new(1.0, 2.0, 3.0) - DVec3::from(eye)) / 10.0;
+            assert!(camera.ray(20.0, 15.0).direction.distance(look) < 1e-12, "{camera:?}");
+        }
+        // The middle of the upper border, 15 / 50 above the axis: (-0.8, 0, -0.6) + 0.3 (-0.6, 0, 0.8).
+        let up = DVec3::new(-0.98, 0.0, -0.36).normalize();
+        assert!(cameras[0].ray(20.0, 0.0).direction.distance(up) < 1e-9, "{:?}", cameras[0].ray(20.0, 0.0));
+    }
+
+    #[test]
+    fn one_sided_images_are_known_by_direction() {
         let mut data = embedded(Split::Train, 8);
         let centre = 0.5 * (data.bounds[0] + data.bounds[1]);
         // Within 40 degrees of the y axis.

@@ -152,16 +152,16 @@ impl CameraPathArgs {
         let (usual, given) = ([view.width, view.height], self.fps.unwrap_or(FPS));
         let flight = |cameras: Vec<Camera>| Ok::<_, Error>((cameras, usual, given));
         let (cameras, usual, fps) = match &self.path {
-            CameraPath::Orbit => flight(self.orbit(view, &run.config.scene, extent, self.count(ORBIT_FRAMES, given)?))?,
+            CameraPath::Orbit => flight(self.orbit(view, &run.config.scene, extent, self.count(None, given)?))?,
             CameraPath::Spiral => {
                 let spiral = self.spiral(view, extent, &photographs(run, model, scene, Split::Train)?);
                 let camera = |pose: DAffine3| Camera::from_angle(view.width, view.height, view.angle_x, pose);
-                flight(spiral.poses(self.count(FRAMES, given)?).into_iter().map(camera).collect())?
+                flight(spiral.poses(self.count(None, given)?).into_iter().map(camera).collect())?
             }
             CameraPath::Spline => {
                 let split = self.split.unwrap_or(Split::Train);
                 let keys = chosen(&photographs(run, model, scene, split)?, &self.keyframes, split)?;
-                let keys = Spline::through(keys, self.closed).frames(self.count(FRAMES, given)?);
+                let keys = Spline::through(keys, self.closed).frames(self.count(None, given)?);
                 flight(keys.iter().map(|key| key.camera(usual)).collect())?
             }
             CameraPath::Test => {
@@ -185,7 +185,7 @@ impl CameraPathArgs {
                     }
                     Motion::Frames(keys) => keys,
                     Motion::Keys { path, seconds } => {
-                        let usual = seconds.map_or(FRAMES, |seconds| (seconds * fps).round().max(1.0) as usize);
+                        let usual = seconds.map(|seconds| (seconds * fps).round().max(1.0) as usize);
                         path.frames(self.count(usual, fps)?)
                     }
                 };
@@ -195,6 +195,11 @@ impl CameraPathArgs {
                 (found.map(|(found, camera)| Camera { pose: found.pose, ..camera }).collect(), usual, fps)
             }
         };
+        Ok(CameraMotion { cameras: self.sized(&cameras, usual), fps })
+    }
+
+    /// The cameras at the size and field of view of the flags. `usual` is the size without flags.
+    fn sized(&self, cameras: &[Camera], usual: [usize; 2]) -> Vec<Camera> {
         let size = match (self.size, self.aspect) {
             (Some(size), _) => size,
             (None, Some(aspect)) => [(usual[1] as f64 * aspect).round().max(1.0) as usize, usual[1]],
@@ -205,7 +210,7 @@ impl CameraPathArgs {
             let camera = fitted(camera, size);
             Camera { focal: focal.map_or(camera.focal, |focal| [focal; 2]), ..camera }
         };
-        Ok(CameraMotion { cameras: cameras.iter().map(fit).collect(), fps })
+        cameras.iter().map(fit).collect()
     }
 
     /// Fails if an option does not apply to the path.
@@ -236,10 +241,11 @@ impl CameraPathArgs {
         Ok(())
     }
 
-    /// Number of frames.
-    fn count(&self, usual: usize, fps: f64) -> Result<usize> {
+    /// Number of frames: of the flags, else of the path's file, else the default of the path.
+    fn count(&self, of_file: Option<usize>, fps: f64) -> Result<usize> {
+        let usual = if self.path == CameraPath::Orbit { ORBIT_FRAMES } else { FRAMES };
         let timed = self.seconds.map(|seconds| (seconds * fps).round().max(1.0) as usize);
-        let count = self.frames.or(timed).unwrap_or(usual);
+        let count = self.frames.or(timed).or(of_file).unwrap_or(usual);
         if count > MOST_FRAMES {
             let field = if self.seconds.is_some() { "seconds" } else { "path" };
             return Err(Error::setting(field, format!("{count} frames are more than the limit of {MOST_FRAMES}")));
@@ -299,6 +305,7 @@ fn chosen(photographs: &[Photograph], words: &[String], split: Split) -> Result<
 mod tests {
     use super::*;
     use raygrad::nerf::glam::DVec3;
+    use std::f64::consts::PI;
 
     #[test]
     fn llff_focus_matches_published_code() {
@@ -350,9 +357,63 @@ mod tests {
         fails(CameraPathArgs { path_transform: Some("x".into()), ..of("orbit") }, "`path-transform`");
         fails(of("spline"), "`keyframes`: is missing");
         assert!(CameraPath::parse("path.txt").is_err() && of("orbit").check().is_ok());
-        assert_eq!(CameraPathArgs { seconds: Some(2.5), ..of("orbit") }.count(7, 30.0).unwrap(), 75);
-        assert_eq!(CameraPathArgs { seconds: Some(1e-3), ..of("orbit") }.count(7, 30.0).unwrap(), 1);
-        assert!(CameraPathArgs { seconds: Some(1e9), ..of("orbit") }.count(7, 30.0).is_err());
-        assert_eq!(of("orbit").count(7, 30.0).unwrap(), 7);
+        assert_eq!(CameraPathArgs { seconds: Some(2.5), ..of("orbit") }.count(Some(7), 30.0).unwrap(), 75);
+        assert_eq!(CameraPathArgs { seconds: Some(1e-3), ..of("orbit") }.count(Some(7), 30.0).unwrap(), 1);
+        assert!(CameraPathArgs { seconds: Some(1e9), ..of("orbit") }.count(Some(7), 30.0).is_err());
+        assert_eq!(of("a.json").count(Some(7), 30.0).unwrap(), 7);
+        assert_eq!(CameraPathArgs { frames: Some(9), ..of("a.json") }.count(Some(7), 30.0).unwrap(), 9);
+        let usual = ["orbit", "spiral", "spline", "a.json"].map(|path| of(path).count(None, 30.0).unwrap());
+        assert_eq!(usual, [60, 120, 120, 120]);
+    }
+
+    #[test]
+    fn orbit_flags_set_radius_and_degrees() {
+        let extent = SceneBox::new([DVec3::ZERO, DVec3::new(2.0, 4.0, 6.0)], [0.5, 9.0]);
+        let view =
+            Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation: 0.3, azimuth: 0.0, reach: PI };
+        let eye = |radius, elevation, scene: &Scene| {
+            let args = CameraPathArgs { radius, elevation, ..CameraPathArgs::default() };
+            let cameras = args.orbit(&view, scene, &extent, 3);
+            assert_eq!(cameras.len(), 3);
+            cameras[0].pose.translation
+        };
+        // 4 times 2.5 from the centre, (1, 2, 3), at 30 and -30 degrees.
+        for (degrees, height) in [(30.0, 8.0), (-30.0, -2.0)] {
+            for scene in [Scene::Folder("scene".into()), Scene::Embedded] {
+                let eye = eye(Some(2.5), Some(degrees), &scene);
+                assert!(eye.distance(DVec3::new(1.0 + 10.0 * 0.75_f64.sqrt(), 2.0, height)) < 1e-12, "{eye}");
+            }
+        }
+        let plain = eye(None, None, &Scene::Folder("scene".into()));
+        assert!((plain.distance(DVec3::new(1.0, 2.0, 3.0)) - 4.0).abs() < 1e-12, "{plain}");
+    }
+
+    #[test]
+    fn size_flags_set_focal_and_vertical_fov() {
+        let camera = Camera::from_angle(40, 30, 2.0 * 0.4_f64.atan(), DAffine3::IDENTITY);
+        let sized = |args: CameraPathArgs| {
+            let cameras = args.sized(&[camera.clone(), camera.clone()], [40, 30]);
+            assert_eq!(cameras.len(), 2);
+            let Camera { width, height, focal, centre, .. } = cameras[1];
+            assert_eq!(centre, [0.5 * width as f64, 0.5 * height as f64]);
+            ([width, height], focal)
+        };
+        let default = CameraPathArgs::default;
+        let (wide, square) = (CameraPathArgs { size: Some([160, 60]), ..default() }, Some(1.0));
+        // 15 / tan(30 degrees) and 30 / tan(30 degrees): half the height.
+        let tan = 3.0_f64.sqrt();
+        for (args, size, focal) in [
+            (default(), [40, 30], 50.0),
+            (wide.clone(), [160, 60], 100.0),
+            (CameraPathArgs { aspect: Some(16.0 / 9.0), ..default() }, [53, 30], 50.0),
+            (CameraPathArgs { aspect: square, ..default() }, [30, 30], 37.5),
+            (CameraPathArgs { fov: Some(60.0), ..default() }, [40, 30], 15.0 * tan),
+            (CameraPathArgs { fov: Some(60.0), ..wide }, [160, 60], 30.0 * tan),
+            (CameraPathArgs { fov: Some(60.0), aspect: square, ..default() }, [30, 30], 15.0 * tan),
+        ] {
+            let (got, focals) = sized(args);
+            assert_eq!(got, size);
+            assert!(focals.iter().all(|own| (own - focal).abs() < 1e-9), "{size:?}: {focals:?}");
+        }
     }
 }
