@@ -73,7 +73,20 @@ pub struct GeometryOptions {
 }
 
 impl GeometryOptions {
-    /// Fails if one of the options is set, as they do not apply to cameras.
+    /// The configuration of a mesh.
+    fn surface_config(&self) -> SurfaceConfig {
+        let default = SurfaceConfig::default();
+        SurfaceConfig {
+            resolution: self.resolution,
+            iso_value: self.iso_value,
+            min_component: self.min_component.unwrap_or(default.min_component),
+            triangles: self.triangles,
+            fill_unseen: !self.no_fill_unseen,
+            closed: !self.open_boundary,
+        }
+    }
+
+    /// Whether nothing of this is asked for, which cameras have no use for.
     pub fn check_absent(&self) -> Result<()> {
         let given = [
             ("points", self.points.is_some()),
@@ -111,16 +124,7 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Pa
             )
         }
         None => {
-            let default = SurfaceConfig::default();
-            let config = SurfaceConfig {
-                resolution: options.resolution,
-                iso_value: options.iso_value,
-                min_component: options.min_component.unwrap_or(default.min_component),
-                triangles: options.triangles,
-                fill_unseen: !options.no_fill_unseen,
-                closed: !options.open_boundary,
-            };
-            let surface = model.surface(&cameras, &config, &mut show)?;
+            let surface = model.surface(&cameras, &options.surface_config(), &mut show)?;
             let mesh = &surface.colored_mesh.mesh;
             if let Some(most) = options.triangles.filter(|most| mesh.triangles.len() > *most) {
                 let count = mesh.triangles.len();
@@ -209,11 +213,43 @@ impl Display {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
     use raygrad::nerf::glam::DVec3;
     use std::f64::consts::PI;
 
     #[test]
-    fn rings_have_no_duplicate_cameras() {
+    fn mesh_flags_reach_the_surface_config() {
+        #[derive(Parser)]
+        struct Flags {
+            #[command(flatten)]
+            options: GeometryOptions,
+        }
+        let config =
+            |flags: &str| Flags::parse_from(format!("export {flags}").split_whitespace()).options.surface_config();
+        let default = SurfaceConfig {
+            resolution: None,
+            iso_value: None,
+            min_component: 0.01,
+            triangles: None,
+            fill_unseen: true,
+            closed: true,
+        };
+        for (flags, expected) in [
+            ("", default),
+            ("--resolution 70", SurfaceConfig { resolution: Some(70), ..default }),
+            ("--iso-value 2.5", SurfaceConfig { iso_value: Some(2.5), ..default }),
+            ("--min-component 0.25", SurfaceConfig { min_component: 0.25, ..default }),
+            ("--min-component 0", SurfaceConfig { min_component: 0.0, ..default }),
+            ("--triangles 80", SurfaceConfig { triangles: Some(80), ..default }),
+            ("--no-fill-unseen", SurfaceConfig { fill_unseen: false, ..default }),
+            ("--open-boundary", SurfaceConfig { closed: false, ..default }),
+        ] {
+            assert_eq!(config(flags), expected, "{flags}");
+        }
+    }
+
+    #[test]
+    fn no_camera_around_a_scene_is_there_twice() {
         let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::new(1.0, 2.0, 1.0)], [0.5, 9.0]);
         let around = |elevation: f64, reach: f64| {
             let view = Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation, azimuth: 0.2, reach };
