@@ -17,7 +17,10 @@ use super::figure::{Axis, Figure, Panel, Series};
 use super::table::{Table, digits};
 use crate::output::note;
 
-/// A training configuration.
+/// The script that trains the classic model in PyTorch and JAX.
+const PEERS: &str = "benches/peers/classic_nerf.py";
+
+/// One way to train.
 struct Course {
     preset: Preset,
     skip: Skip,
@@ -215,16 +218,21 @@ fn add_peers(
     }
 }
 
-/// Seconds of a training step according to `benches/peers/classic_nerf.py`.
-fn seconds_a_step(framework: &str, quick: bool) -> std::result::Result<f64, String> {
-    let script = "benches/peers/classic_nerf.py";
-    if !std::path::Path::new(script).is_file() {
-        return Err(format!("{script} is not here: run in a checkout of the repository"));
-    }
+/// The command that measures a training step of another framework, with as many threads as raygrad.
+fn peer_command(framework: &str, quick: bool, threads: usize) -> Command {
     let steps = if quick { "1" } else { "5" };
-    let threads = rayon::current_num_threads().to_string();
-    let arguments = [script, "--framework", framework, "--steps", steps, "--threads", &threads];
-    let output = Command::new("python3").args(arguments).output().map_err(|e| format!("python3 cannot be run: {e}"))?;
+    let mut command = Command::new("python3");
+    command.args([PEERS, "--framework", framework, "--steps", steps, "--threads", &threads.to_string()]);
+    command
+}
+
+/// What `benches/peers/classic_nerf.py` reports for a training step.
+fn seconds_a_step(framework: &str, quick: bool) -> std::result::Result<f64, String> {
+    if !std::path::Path::new(PEERS).is_file() {
+        return Err(format!("{PEERS} is not here: run in a checkout of the repository"));
+    }
+    let output = peer_command(framework, quick, rayon::current_num_threads()).output();
+    let output = output.map_err(|e| format!("python3 cannot be run: {e}"))?;
     if !output.status.success() {
         let message = String::from_utf8_lossy(&output.stderr);
         let last = message.lines().last().unwrap_or("no message");
@@ -233,7 +241,7 @@ fn seconds_a_step(framework: &str, quick: bool) -> std::result::Result<f64, Stri
     let text = String::from_utf8_lossy(&output.stdout);
     let line: Option<Value> = text.lines().last().and_then(|line| serde_json::from_str(line).ok());
     let seconds = line.and_then(|line| line["seconds_per_step"].as_f64());
-    seconds.ok_or_else(|| format!("{script} printed no seconds_per_step"))
+    seconds.ok_or_else(|| format!("{PEERS} printed no seconds_per_step"))
 }
 
 #[cfg(test)]
@@ -247,5 +255,18 @@ mod tests {
         assert_eq!(name(Preset::Voxel, Skip::Off), "voxel, no skipping");
         assert_eq!(name(Preset::Small, Skip::Fast), "small, skipping");
         assert_eq!(name(Preset::Small, Skip::Off), "small");
+    }
+
+    #[test]
+    fn peer_command_has_the_threads_and_steps() {
+        let words = |framework, quick, threads| {
+            let command = peer_command(framework, quick, threads);
+            let words = std::iter::once(command.get_program()).chain(command.get_args());
+            words.map(|word| word.to_str().unwrap().to_owned()).collect::<Vec<_>>().join(" ")
+        };
+        let script = "python3 benches/peers/classic_nerf.py";
+        assert_eq!(words("torch", true, 3), format!("{script} --framework torch --steps 1 --threads 3"));
+        assert_eq!(words("jax", false, 12), format!("{script} --framework jax --steps 5 --threads 12"));
+        assert!(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(PEERS).is_file());
     }
 }
