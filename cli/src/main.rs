@@ -47,6 +47,7 @@ use raygrad::tensor::simd;
 
 use interrupt::{Stop, Work};
 use output::{complain, print};
+use train::Trained;
 
 /// Help text on exit codes.
 const EXIT_CODES: &str = "\
@@ -106,7 +107,7 @@ fn run(cli: Cli) -> Work<ExitCode> {
         pool.map_err(|e| Error::setting("threads", e))?;
     }
     match cli.command {
-        None => return first_run(),
+        None => return first_run(&train::Args::default()),
         Some(Command::Train(args)) => {
             let trained = train::run(&args)?;
             if !trained.diverged {
@@ -128,11 +129,15 @@ fn run(cli: Cli) -> Work<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Runs without a subcommand: trains with all defaults and renders an image.
-fn first_run() -> Work<ExitCode> {
-    let trained = train::run(&train::Args::default())?;
-    if !trained.interrupted && !trained.diverged {
-        render::run(&render::Args::picture(&trained.folder))?;
+/// What the bare program does: trains, and renders an image if training came to its end.
+fn first_run(args: &train::Args) -> Work<ExitCode> {
+    end_first_run(&train::run(args)?, |folder| render::run(&render::Args::picture(folder)))
+}
+
+/// Renders if training came to its end, and prints what can be done with the run unless it diverged.
+fn end_first_run(trained: &Trained, render: impl FnOnce(&Path) -> Work<()>) -> Work<ExitCode> {
+    if trained.is_complete() {
+        render(&trained.folder)?;
     }
     if !trained.diverged {
         suggest(&trained.folder)?;
@@ -152,8 +157,9 @@ fn suggest(folder: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::Cli;
-    use clap::{Command, CommandFactory};
+    use clap::{Command, CommandFactory, Parser};
     use std::path::Path;
+    use std::process::ExitCode;
 
     /// The program and its commands, ready to print help.
     pub fn commands() -> Vec<Command> {
@@ -171,7 +177,39 @@ mod tests {
     }
 
     #[test]
-    fn short_help_options_have_one_line() {
+    fn first_run_trains_and_renders_an_image() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = folder.path().join("run");
+        let small = "train --steps 1 --downscale 20 --set field.grid.levels=2 --set field.grid.log2_table=8 \
+                     --set sampler.occupancy.resolution=16 --set sampler.samples=64 --set sampler.step=0.05 \
+                     --set sampler.view_step=0.05 --out";
+        let args = super::train::Args::parse_from(small.split_whitespace().chain(run.to_str()));
+        assert!(super::first_run(&args).is_ok_and(|code| code == ExitCode::SUCCESS));
+        let image = raygrad::nerf::Image::open(run.join("picture.png")).unwrap();
+        assert_eq!([image.width, image.height], [10, 10]);
+    }
+
+    #[test]
+    fn first_run_renders_after_complete_training() {
+        for (interrupted, diverged, renders, code) in [
+            (false, false, true, ExitCode::SUCCESS),
+            (true, false, false, ExitCode::from(130)),
+            (false, true, false, ExitCode::FAILURE),
+            (true, true, false, ExitCode::from(130)),
+        ] {
+            let trained = super::Trained { folder: "run".into(), interrupted, diverged };
+            let mut rendered = vec![];
+            let ended = super::end_first_run(&trained, |folder| {
+                rendered.push(folder.to_owned());
+                Ok(())
+            });
+            assert!(ended.is_ok_and(|ended| ended == code), "{interrupted} {diverged}");
+            assert_eq!(rendered, vec![Path::new("run"); usize::from(renders)], "{interrupted} {diverged}");
+        }
+    }
+
+    #[test]
+    fn short_help_has_one_line_an_option() {
         for mut command in commands() {
             let help = command.render_help().to_string();
             for line in help.lines() {

@@ -145,3 +145,27 @@ fn default_budget(preset: Preset) -> Duration {
         Preset::Classic => Duration::from_secs(3600),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[test]
+    fn budget_is_of_the_flag_or_the_preset() {
+        let budget = |flags: &str| Args::parse_from(format!("train {flags}").split_whitespace()).budget();
+        let seconds = |seconds| Budget::Time(Duration::from_secs(seconds));
+        for (flags, expected) in [
+            ("", seconds(45)),
+            ("--preset instant", seconds(45)),
+            ("--preset voxel", seconds(45)),
+            ("--preset small", seconds(100)),
+            ("--preset classic", seconds(3600)),
+            ("--preset classic --budget 10m", seconds(600)),
+            ("--preset small --steps 7", Budget::Steps(7)),
+        ] {
+            assert_eq!(budget(flags), expected, "{flags}");
+        }
+        assert_eq!(Args::default().budget(), seconds(45), "the bare program");
+    }
+}
