@@ -6,8 +6,8 @@ use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::{Camera, Config, Image, Model, SceneBox};
 use serde_json::{Value, json};
 
-/// Loads the model of a run.
-fn model(place: &Place, run: &str) -> Model<f32> {
+/// The model of a run.
+pub fn model(place: &Place, run: &str) -> Model<f32> {
     let config = place.json(&format!("{run}/config.json"));
     let extent: SceneBox = serde_json::from_value(config["scene_box"].clone()).unwrap();
     let settings: Config = serde_json::from_value(config["config"].clone()).unwrap();
@@ -97,15 +97,15 @@ fn loss_terms_and_near_plane_are_configurable() {
     }
 }
 
-/// The render in the first image of an evaluation.
-fn rendered(place: &Place, name: &str) -> Image {
+/// The rendered part of the first picture of an evaluation.
+pub fn rendered(place: &Place, name: &str) -> Image {
     let picture = png(&place.path(&format!("{name}/000.png")));
     let data = (0..SIZE * SIZE).flat_map(|i| picture.pixel(SIZE + i % SIZE, i / SIZE).to_vec()).collect();
     Image { width: SIZE, height: SIZE, channels: 3, data }
 }
 
-/// The largest difference of two images.
-fn apart(a: &Image, b: &Image) -> f32 {
+/// How far two images are apart, at most.
+pub fn apart(a: &Image, b: &Image) -> f32 {
     assert_eq!([a.width, a.height], [b.width, b.height]);
     a.data.iter().zip(&b.data).map(|(a, b)| (a - b.clamp(0.0, 1.0)).abs()).fold(0.0, Real::maximum)
 }
