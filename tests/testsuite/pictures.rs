@@ -66,7 +66,7 @@ fn pictures(view: &View) -> [(&'static str, Image); 3] {
     };
     [
         ("golden-color.png", view.color.over([1.0; 3])),
-        ("golden-depth.png", each(&view.depth, &|d| [((d[0] - 2.0) / 4.0).max(0.0); 3])),
+        ("golden-depth.png", each(&view.depth, &|d| [Real::maximum((d[0] - 2.0) / 4.0, 0.0); 3])),
         ("golden-normal.png", each(&view.normal, &|n| [0, 1, 2].map(|i| 0.5 + 0.5 * n[i]))),
     ]
 }

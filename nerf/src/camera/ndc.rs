@@ -144,6 +144,7 @@ mod tests {
                 let [x, y] = [(i % 8) as f64 / 7.0 * 100.0, (i / 8) as f64 / 5.0 * 40.0];
                 for distance in [0.5, 1.0, 30.0, 1e6] {
                     let local = ndc.axes.transpose() * (camera.ray(x, y).at(distance) - ndc.eye);
+                    assert!(local.is_finite() && local.z < 0.0, "{local}");
                     widest = widest.max(local.xy().abs() / -local.z / DVec2::from(ndc.slopes));
                     nearest = nearest.min(-local.z);
                 }

@@ -165,6 +165,7 @@ mod tests {
     use super::*;
     use crate::model::SceneBox;
     use crate::model::config::{Config, Preset};
+    use raygrad_tensor::Real;
 
     fn model() -> Model<f32> {
         let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
@@ -191,8 +192,8 @@ mod tests {
         assert!(all.color == whole.color && normals == model.normals(&camera));
         for upper in [[-1.5, 2.0, 2.0], [-3.0, 2.0, 2.0], [0.0, -2.0, 2.0]] {
             let (none, normals) = within([-2.0; 3], upper);
-            // The last has its corners swapped.
-            let most = |image: &Image| image.data.iter().fold(0.0_f32, |most, x| most.max(x.abs()));
+            // One with its corners the wrong way round too.
+            let most = |image: &Image| image.data.iter().fold(0.0_f32, |most, x| Real::maximum(most, x.abs()));
             assert_eq!([most(&none.opacity), most(&normals)], [0.0; 2]);
         }
         // The left half of the image.

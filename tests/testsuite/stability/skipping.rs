@@ -122,7 +122,7 @@ fn early_terminated_ray_has_the_full_colour() {
         let (mut model, camera) = fog_model(Fog { sigma: 10.0, white_behind: false }, skip);
         model.finish();
         let view = model.render(&camera, [0.0; 3]);
-        let brightest = view.color.data.iter().fold(0.0_f32, |a, &b| a.max(b));
+        let brightest = view.color.data.iter().copied().fold(0.0_f32, raygrad::Real::maximum);
         within("brightest", brightest.into(), 1.0, 1e-6);
     }
 }

@@ -1,5 +1,6 @@
 use super::*;
 use glam::DAffine3;
+use raygrad_tensor::Real;
 use std::path::Path;
 
 fn camera(lens: Lens) -> Camera {
@@ -57,7 +58,7 @@ fn undistorted_image_equals_a_pinhole_image() {
             let off = pixel.iter().zip(expected).map(|(a, b)| (a - b).abs());
             // The source image ends within a pixel of the border.
             let inside = (2..to.width - 2).contains(&x) && (2..to.height - 2).contains(&y);
-            worst = off.fold(worst, |worst, off| if inside { worst.max(off) } else { worst });
+            worst = off.fold(worst, |worst, off| if inside { Real::maximum(worst, off) } else { worst });
         }
         assert!(worst < 2e-3, "{lens:?}: {worst}");
     }

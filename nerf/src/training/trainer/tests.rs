@@ -291,7 +291,7 @@ fn lr_scale_scales_all_updates() {
         let after = trainer.model.params.values().iter();
         let moved = |(a, b): (&Tensor<f32>, &Tensor<f32>)| {
             let moves = a.as_slice().iter().zip(b.as_slice()).map(|(a, b)| f64::from(a - b).abs());
-            moves.fold(0.0, f64::max)
+            moves.fold(0.0, raygrad_tensor::Real::maximum)
         };
         (rate, after.zip(before.values()).map(moved).collect::<Vec<f64>>())
     });
