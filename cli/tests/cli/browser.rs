@@ -489,12 +489,12 @@ fn browser_shows_and_controls_training() {
     assert!(place.path("run/model.safetensors").exists());
 }
 
-/// `PAGES=RUN,RUN cargo test --release --test cli ten_views -- --nocapture` measures other runs, given by absolute
-/// paths.
+/// `PAGES=RUN,RUN cargo test --release --test cli ten_views -- --ignored --nocapture` measures runs, by their whole paths.
 #[test]
-fn scene_page_equals_render_in_ten_views() {
-    let Ok(runs) = std::env::var("PAGES") else { return };
-    let Some(mut browser) = Browser::open(Kind::Chromium) else { return };
+#[ignore = "measurement: PAGES names the runs to show"]
+fn a_page_and_the_program_agree_in_ten_views() {
+    let runs = std::env::var("PAGES").expect("PAGES=RUN,RUN names the runs to show");
+    let mut browser = Browser::open(Kind::Chromium).expect("Chromium shows the pages");
     browser.size(200, 150, false);
     let place = Place::empty();
     for (number, run) in runs.split(',').enumerate() {

@@ -984,12 +984,13 @@ fn milliseconds_from_drag_to_first_and_final_image() {
     }
 }
 
-/// `COST=SCENE cargo test --release --test cli page_cost -- --nocapture` measures how much longer training on a scene
-/// takes.
+/// `COST=SCENE cargo test --release --test cli what_pages_cost -- --ignored --nocapture` measures how much longer training on
+/// a scene takes.
 #[test]
-fn page_cost_during_training() {
+#[ignore = "measurement: COST names the scene to train on"]
+fn what_pages_cost_training() {
     const ROUNDS: usize = 7;
-    let Ok(scene) = std::env::var("COST") else { return };
+    let scene = std::env::var("COST").expect("COST=SCENE names the scene to train on");
     let place = Place::empty();
     // The time and CPU use of training without a page, with a hidden page and with a visible one. The clock ticks of
     // ended children include those of other tests.
