@@ -10,6 +10,7 @@ use raygrad::nerf::{
     Budget, ClassicConfig, Config, FieldConfig, Image, InstantConfig, Loss, Preset, SamplerConfig, Trainer, VoxelConfig,
 };
 use raygrad_scenes::embedded;
+use raygrad_test_support::skip::skipped;
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
@@ -92,7 +93,7 @@ fn embedded_scene_is_learned_in_seconds() {
 fn lego_is_learned_in_seconds() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/lego");
     if !folder.is_dir() {
-        println!("skipped: there is no folder {}", folder.display());
+        skipped(&format!("there is no folder {}", folder.display()));
         return;
     }
     let [train, mut test] = [Split::Train, Split::Test].map(|split| load(&folder, split, 10).unwrap());

@@ -4,6 +4,7 @@ use super::{CLASSIC, Place};
 use raygrad::nerf::dataset::{Capture, Format, Photo, Split, View};
 use raygrad::nerf::glam::{DMat3, DVec3};
 use raygrad::nerf::{Camera, Image, Lens};
+use raygrad_test_support::skip::skipped;
 use serde_json::{Value, json};
 use std::collections::HashSet;
 use std::path::PathBuf;
@@ -17,7 +18,7 @@ fn fox() -> Option<PathBuf> {
     let fox = std::env::var_os("RAYGRAD_DATA").map_or_else(here, PathBuf::from).join("fox");
     let is_there = fox.join("transforms.json").is_file();
     if !is_there {
-        println!("skipped: there is no {}; RAYGRAD_DATA may say where the fox is", fox.display());
+        skipped(&format!("there is no {}; RAYGRAD_DATA may say where the fox is", fox.display()));
     }
     is_there.then_some(fox)
 }

@@ -6,6 +6,7 @@
 use super::Place;
 use super::SMALL;
 use super::resume::assert_same;
+use raygrad_test_support::skip::skipped;
 use std::process::{Command, Output};
 
 /// System calls that change the disk, and their purpose.
@@ -28,7 +29,7 @@ fn stride() -> usize {
 fn has_strace() -> bool {
     let found = Command::new("strace").arg("-V").output().is_ok_and(|output| output.status.success());
     if !found {
-        println!("skipped: strace is not installed");
+        skipped("strace is not installed");
     }
     found
 }
@@ -69,7 +70,7 @@ fn has_names(calls: &[String]) -> bool {
     let found = CALLS.iter().all(|(call, _)| !about_the_run(calls, call).is_empty());
     assert!(found || !cfg!(all(target_arch = "x86_64", target_env = "gnu")), "{calls:?}");
     if !found {
-        println!("skipped: calls to this system have other names");
+        skipped("calls to this system have other names");
     }
     found
 }

@@ -2,6 +2,7 @@
 
 use super::Place;
 use super::SMALL;
+use raygrad_test_support::skip::skipped;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
@@ -61,7 +62,7 @@ fn tensorboard_reads_metrics_of_a_resumed_run() {
     assert!(!place.path("other/tensorboard").exists());
 
     let Some(python) = python() else {
-        println!("skipped: no Python has TensorBoard; name one that has in RAYGRAD_PYTHON");
+        skipped("no Python has TensorBoard; name one that has in RAYGRAD_PYTHON");
         return;
     };
     let folder = place.path("run/tensorboard");

@@ -6,6 +6,7 @@ use raygrad::nerf::dataset::{Capture, Depths, Split};
 use raygrad::nerf::glam::{DAffine3, DVec3};
 use raygrad::nerf::{Camera, Config, Image, Model, SceneBox};
 use raygrad_scenes::ANGLE_X;
+use raygrad_test_support::skip::skipped;
 use serde_json::{Value, json};
 use std::process::{Command, Stdio};
 
@@ -333,7 +334,7 @@ fn videos_hold_the_frames_at_their_speed() {
 pub fn has_ffmpeg() -> bool {
     let found = Command::new("ffmpeg").arg("-version").stdout(Stdio::null()).status().is_ok();
     if !found {
-        println!("skipped: ffmpeg is not installed");
+        skipped("ffmpeg is not installed");
     }
     found
 }

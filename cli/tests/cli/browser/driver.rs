@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use base64::prelude::{BASE64_STANDARD, Engine};
 use raygrad::nerf::Image;
+use raygrad_test_support::skip::skipped;
 use serde_json::{Map, Value, json};
 use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
@@ -68,7 +69,7 @@ impl Program {
     /// Starts a browser; returns `None` and prints a message if it is not installed.
     fn start(kind: Kind) -> Option<Self> {
         let Some(name) = kind.installed() else {
-            println!("skipped: {kind:?} is not installed");
+            skipped(&format!("{kind:?} is not installed"));
             return None;
         };
         let profile = tempfile::tempdir().unwrap().keep();
@@ -279,7 +280,7 @@ impl Browser {
         let draws = self.value("document.createElement('canvas').getContext('webgl2') !== null") == true;
         assert!(draws || self.kind == Kind::Firefox);
         if !draws {
-            println!("skipped: Firefox has no WebGL 2 here");
+            skipped("Firefox has no WebGL 2 here");
         }
         draws
     }

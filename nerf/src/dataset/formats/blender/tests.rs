@@ -3,6 +3,7 @@ use crate::camera::pinhole::Camera;
 use crate::dataset::formats::kit::{cases, damage, failure, frames, is_whole, picture, remove, says};
 use glam::{DAffine3, DMat3, DVec3};
 use proptest::prelude::*;
+use raygrad_test_support::skip::skipped;
 use serde_json::json;
 
 const FILE: &str = "transforms_train.json";
@@ -143,7 +144,7 @@ fn fields_of_other_programs_are_read() {
 fn lego_is_read() {
     let lego = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/lego"));
     if !lego.is_dir() {
-        println!("skipped: there is no {}", lego.display());
+        skipped(&format!("there is no folder {}", lego.display()));
         return;
     }
     let capture = read(lego).unwrap();

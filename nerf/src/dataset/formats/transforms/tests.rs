@@ -3,6 +3,7 @@ use crate::dataset::capture::Point;
 use crate::dataset::formats::kit::{cases, damage, failure, frames, is_whole, picture, pose, remove, says};
 use glam::DVec3;
 use proptest::prelude::*;
+use raygrad_test_support::skip::skipped;
 use serde_json::json;
 
 mod writing;
@@ -253,7 +254,7 @@ fn aabb_scale_is_read_other_fields_are_ignored() {
 fn transforms_of_instant_ngps_fox_are_read() {
     let fox = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/fox"));
     if !fox.is_dir() {
-        println!("skipped: there is no {}", fox.display());
+        skipped(&format!("there is no folder {}", fox.display()));
         return;
     }
     let capture = read(fox).unwrap();
