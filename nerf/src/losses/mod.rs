@@ -112,8 +112,9 @@ impl<'t, T: Scalar> LossInputs<'_, 't, T> {
 pub trait LossTerm<T: Scalar>: Any + Send + Sync {
     /// Computes the term as a sum over rays, a scalar, times its weight.
     ///
-    /// Training minimises its mean over rays and three channels, as for the squared errors: a weight of 1 counts as
-    /// three squared errors.
+    /// The trainer divides the sum by three times the number of rays, like the squared errors of three channels. A term
+    /// of 1 on every ray adds 1/3 to the loss at weight 1. Where others take the mean over rays with weight λ, the
+    /// weight here is 3 λ.
     fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T>;
 
     /// Returns whether it reads [normals](Rendered::normals), for which positions must be on the tape.

@@ -20,8 +20,8 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TotalVariationConfig {
-    /// Weight of the term. It multiplies the mean over rays: a weight of 1 counts as much as three squared errors
-    /// of colours. Range: 0 to 1000000.
+    /// Weight of the term. At weight 1, a third of the total variation is added to the mean squared error of the
+    /// colours. Range: 0 to 1000000.
     pub weight: f64,
     /// Name of the table to smooth, such as `field.table`.
     pub params: String,
