@@ -46,7 +46,8 @@ pub struct Capture {
     pub points: Vec<Point>,
     /// The file of the points, if there is one.
     pub points_file: Option<PathBuf>,
-    /// instant-ngp's `aabb_scale`: half the side of the scene box in units of its unit cube, if given.
+    /// instant-ngp's `aabb_scale`, if given: the side of its scene box, in sides of its unit cube. It is kept for
+    /// export, and does not affect raygrad's own box.
     pub aabb_scale: Option<f64>,
     /// The transform that was applied to the original (COLMAP) coordinates: nerfstudio's `applied_transform` and
     /// `applied_scale`. The identity if not given.

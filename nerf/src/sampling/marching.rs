@@ -35,8 +35,9 @@ pub struct MarchingConfig {
     /// The same in rendering. Training starts each ray at a random offset, so finer intervals fit. Unit: longest
     /// side of the scene box. Range: 0.00001 to 1.
     pub view_step: f64,
-    /// Growth of the interval with distance from the camera. 0 keeps intervals even; 1/256 is usual for unbounded
-    /// scenes. See [`Step::cone`]. Unit: 1 / scene unit. Range: 0 to 1.
+    /// Growth of the interval with distance from the camera, a number without unit: at distance t an interval is
+    /// `step + cone t` long. 0 keeps intervals even. Unbounded scenes use 1/64, coarser than the 1/256 of
+    /// instant-ngp. See [`Step::cone`]. Range: 0 to 1.
     pub cone: f64,
     /// Samples in a training step. The number of rays follows from it. Range: 1 to 16777216.
     pub samples: usize,
