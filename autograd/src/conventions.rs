@@ -7,7 +7,8 @@
 //! The rules behind the table:
 //!
 //! * NaN propagates, unless the result does not depend on it.
-//! * Tied elements share the gradient evenly.
+//! * Tied elements share the gradient evenly. `max_pool2d` is an exception: the first of equal elements, in row-major
+//!   order, gets all of it.
 //! * A step has gradient 0.
 //! * A kink has the gradient of the side that its formula takes.
 //! * Where infinity times 0 would be NaN but a limit exists, the value is that limit.

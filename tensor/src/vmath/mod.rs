@@ -1,10 +1,13 @@
-//! Elementary functions without branches, which LLVM vectorises inside loops.
+//! Elementary functions, most of them without branches, so that LLVM vectorises them inside loops.
 //!
 //! libm's `exp` or `sin` is a call, and a call prevents vectorisation. These functions are straight-line code: every
 //! choice is a select, and every constant is a literal. They are inlined into the caller's loop. Inside
 //! [`simd::dispatch`](crate::simd::dispatch) sixteen f32 elements run at once.
 //!
-//! Conventions of all functions:
+//! `tan`, `asin`, `acos`, `atan`, `atan2` and `pow` are exceptions. They call the standard library, which prevents
+//! vectorisation, and their accuracy and bits are those of the platform.
+//!
+//! Conventions of all other functions:
 //! - Subnormal arguments and results are exact to the stated bound, not flushed. NaN gives NaN, infinities give the
 //!   limits, and odd functions keep the sign of zero.
 //! - Every multiply-add is written `mul_add` and rounds once, so that a result has the same bits on every instruction

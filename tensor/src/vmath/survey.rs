@@ -1,4 +1,5 @@
-//! Every function of `vmath` with its argument range, its bound and a reference: for tests and benchmarks.
+//! The functions of `vmath` that raygrad computes itself, except `sinh` and `cosh`. Each has its argument range, its
+//! bound and a reference, for tests and benchmarks.
 
 use super::{f32 as single, f64 as double};
 use crate::{Real, Scalar, lanes, lanes_real};
