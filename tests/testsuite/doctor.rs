@@ -103,7 +103,7 @@ fn good_capture_has_no_findings() {
     assert!(report.facts.agreement.unwrap() > 0.4, "{:?}", report.facts.agreement);
     let parts: Vec<_> = report.facts.subsets.iter().map(|part| (part.split, part.present, part.absent)).collect();
     assert_eq!(parts, [(Split::Train, 40, 0), (Split::Test, 8, 0)]);
-    assert_eq!(report.facts.resolutions, [Resolution { width: SIZE, height: SIZE, photographs: 48 }]);
+    assert_eq!(report.facts.resolutions, [Resolution { width: SIZE, height: SIZE, images: 48 }]);
     let again: Report = serde_json::from_str(&serde_json::to_string(&report).unwrap()).unwrap();
     assert_eq!(again, report);
 }
