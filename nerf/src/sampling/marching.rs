@@ -37,7 +37,7 @@ pub struct MarchingConfig {
     pub view_step: f64,
     /// Growth of the interval with distance from the camera, a number without unit: at distance t an interval is
     /// `step + cone t` long. 0 keeps intervals even. Unbounded scenes use 1/64, coarser than the 1/256 of
-    /// instant-ngp. See [`Step::cone`]. Range: 0 to 1.
+    /// instant-ngp. Renders scale it by `view_step / step`. See [`Step::cone`]. Range: 0 to 1.
     pub cone: f64,
     /// Samples in a training step. The number of rays follows from it. Range: 1 to 16777216.
     pub samples: usize,

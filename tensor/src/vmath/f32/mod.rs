@@ -1,5 +1,5 @@
-//! Single precision: at most 1 ULP for `exp`, `exp2` and `ln`, 4 ULP for `sinh` and `cosh`, and 2 ULP for the others,
-//! over all 2^32 arguments. The functions that [call the standard library](super) have no stated bound.
+//! Single precision: at most 1 ULP for `exp`, `exp2` and `ln`, and 2 ULP for the others, over all 2^32 arguments.
+//! `sinh` and `cosh` are within 4 ULP on samples. Functions that [call the standard library](super) have no bound here.
 
 mod erf;
 mod exp;

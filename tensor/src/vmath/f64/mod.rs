@@ -1,5 +1,5 @@
-//! Double precision: at most 2 ULP, measured on large samples, and 4 ULP for `sinh` and `cosh`. The functions work as
-//! those in single precision.
+//! Double precision: at most 2 ULP, measured on large samples; `sinh` and `cosh` 4 ULP. The functions work as those in
+//! single precision.
 
 mod erf;
 mod exp;
