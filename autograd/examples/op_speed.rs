@@ -43,7 +43,7 @@ fn main() -> Result<(), rayon::ThreadPoolBuildError> {
         ("logsumexp", |x, _| x.logsumexp_over(-1)),
         ("layer_norm", |x, rest| x.layer_norm(&rest[0], &rest[1], 1e-5)),
         ("cross_entropy", |x, _| x.cross_entropy(vec![1; x.value().len() / x.shape()[1]])),
-        ("binary_cross_entropy", |x, rest| x.binary_cross_entropy_with_logits(&rest[2])),
+        ("binary_cross_entropy_with_logits", |x, rest| x.binary_cross_entropy_with_logits(&rest[2])),
         ("mse_loss", |x, rest| x.mse_loss(&rest[2])),
         ("sum", |x, _| x.sum()),
         ("sum over axis 0", |x, _| x.sum_over(0)),

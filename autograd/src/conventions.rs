@@ -115,7 +115,7 @@
 //! | `silu(x)` | `-inf` | `0` | `0` | |
 //! | `silu(x)` | `inf` | `inf` | `1` | |
 //! | `tanh(x)` | `inf` | `1` | `0` | |
-//! | `binary_cross_entropy(a, b)` | `1000; 0` | `1000` | `1; -1000` | |
+//! | `binary_cross_entropy_with_logits(a, b)` | `1000; 0` | `1000` | `1; -1000` | |
 
 #[cfg(test)]
 mod tests {
@@ -178,7 +178,7 @@ mod tests {
             "gelu_tanh(x)" => a.gelu_tanh(),
             "silu(x)" => a.silu(),
             "tanh(x)" => a.tanh(),
-            "binary_cross_entropy(a, b)" => a.binary_cross_entropy_with_logits(b),
+            "binary_cross_entropy_with_logits(a, b)" => a.binary_cross_entropy_with_logits(b),
             _ => return None,
         })
     }

@@ -89,6 +89,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// As [`grad`](Self::grad).
     #[track_caller]
+    #[doc(alias = "create_graph")]
     pub fn grad_graph(&self, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
         self.tape.or_raise(self.try_grad_graph(wrt))
     }

@@ -138,8 +138,8 @@ def main():
         if mesh is not None:
             found |= {"triangles": len(mesh.faces), "closed": bool(mesh.is_watertight), "volume": float(mesh.volume)}
         print(json.dumps(found | measure(args.truth, places, normals, mesh)), flush=True)
-    if args.level:
-        places, faces, normals, seconds = marching_cubes(args.truth, args.level)
+    if args.iso_value:
+        places, faces, normals, seconds = marching_cubes(args.truth, args.iso_value)
         mesh = trimesh.Trimesh(places, faces, process=False)
         if mesh.volume < 0:
             mesh.invert()

@@ -159,8 +159,10 @@ elementwise! {
     /// `e^self - 1`, accurate near 0.
     expm1() = Expm1;
     /// The natural logarithm: -inf at 0, NaN below.
+    #[doc(alias = "log")]
     ln() = Ln;
     /// `ln(1 + self)`, accurate near 0.
+    #[doc(alias = "log1p")]
     ln1p() = Ln1p;
     /// The square root: NaN below 0, infinite gradient at 0.
     sqrt() = Sqrt;

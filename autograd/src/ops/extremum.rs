@@ -102,6 +102,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If an axis does not exist or is named twice, or there are no elements to choose from.
     #[track_caller]
+    #[doc(alias = "amax")]
     pub fn max_over(&self, axes: impl Into<Axes>) -> Self {
         self.extremum(axes.into(), true)
     }

@@ -104,7 +104,7 @@ impl SmoothL1 {
 #[derive(Clone, Copy)]
 pub struct BinaryCrossEntropy;
 impl Formula<2> for BinaryCrossEntropy {
-    const NAME: &'static str = "binary_cross_entropy";
+    const NAME: &'static str = "binary_cross_entropy_with_logits";
     #[inline(always)]
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         let (zero, one) = (a.like(0.0), a.like(1.0));
@@ -285,7 +285,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.loss(BinaryCrossEntropy, target)
     }
 
-    /// The mean of [`binary_cross_entropy`](Self::binary_cross_entropy) from logits, as a scalar.
+    /// The mean of [`binary_cross_entropy_with_logits`](Self::binary_cross_entropy_with_logits), as a scalar.
     ///
     /// # Panics
     /// If the shapes differ.

@@ -129,6 +129,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
+    #[doc(alias = "eq")]
     pub fn elementwise_eq(&self, other: impl Operand<'t, T>) -> Mask {
         self.compare("elementwise_eq", other, |a, b| a.elementwise_eq(b))
     }

@@ -328,6 +328,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist, the range leaves it, or the step is 0.
     #[track_caller]
+    #[doc(alias = "narrow")]
     pub fn slice_axis(&self, axis: isize, range: impl Into<Slice>) -> Self {
         self.view("slice_axis", |layout| layout.sliced_axis(axis, range))
     }
@@ -356,6 +357,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If there are none, the axis does not exist, or other extents differ.
     #[track_caller]
+    #[doc(alias = "cat")]
     pub fn concat(parts: &[&Self], axis: isize) -> Self {
         let Some(first) = parts.first() else { panic!("concat of no tensors") };
         first.tape().apply(Concat { axis: first.axis("concat", axis) }, parts)

@@ -150,8 +150,8 @@ def losses():
     probabilities = dict(a=((-6, 6),), b=((0.05, 0.95),), broadcast=False)
     # The peer's own function does not give the gradient of the target where it is differentiated twice.
     entropy = lambda a, b: (1 - b) * a - F.logsigmoid(a)
-    binary("binary_cross_entropy", entropy, **probabilities)
-    binary("binary_cross_entropy.loss", lambda a, b: entropy(a, b).mean(), **probabilities)
+    binary("binary_cross_entropy_with_logits", entropy, **probabilities)
+    binary("binary_cross_entropy_with_logits.loss", lambda a, b: entropy(a, b).mean(), **probabilities)
     classes = torch.tensor([2, 0, 2])
     case("cross_entropy", lambda x: F.cross_entropy(x, classes, **none), spread((3, 4), (-3, 3)))
     case("cross_entropy.wide", lambda x: F.cross_entropy(x, 17 * classes, **none), spread((3, 40), (-3, 3)))

@@ -95,8 +95,8 @@ fn losses() -> Vec<Case> {
         "huber.huber_loss": |x| x[0].huber_loss(&x[1], 1.0);
         "smooth_l1": |x| x[0].smooth_l1(&x[1], 0.5);
         "smooth_l1.smooth_l1_loss": |x| x[0].smooth_l1_loss(&x[1], 0.25);
-        "binary_cross_entropy": |x| x[0].binary_cross_entropy_with_logits(&x[1]);
-        "binary_cross_entropy.loss": |x| x[0].binary_cross_entropy_with_logits_loss(&x[1]);
+        "binary_cross_entropy_with_logits": |x| x[0].binary_cross_entropy_with_logits(&x[1]);
+        "binary_cross_entropy_with_logits.loss": |x| x[0].binary_cross_entropy_with_logits_loss(&x[1]);
         "cross_entropy": |x| x[0].cross_entropy([2, 0, 2]);
         "cross_entropy.wide": |x| x[0].cross_entropy([34, 0, 34]);
         "cross_entropy.loss": |x| x[0].cross_entropy_loss([2, 0, 2]);
