@@ -223,7 +223,6 @@ pub fn run(args: &Args) -> Work<()> {
     done?;
     match kind {
         Kind::Video(_) if !args.keep_frames => frames.remove(),
-        Kind::Video(_) => frames.keep(),
         _ => {
             frames.keep();
             let older = other_numbered(&out, DIGITS, &(0..cameras.len()).collect::<Vec<_>>());

@@ -258,6 +258,10 @@ fn doctor_finds_single_wrong_poses() {
     // In any unit.
     planted.repose(|pose| DAffine3 { translation: 0.01 * pose.translation, ..pose });
     assert_eq!(planted.cameras().finds(Kind::FarCamera).unwrap().views, ["10.png"]);
+    let mut planted = Planted::new();
+    planted.camera(10).pose.translation *= 2.0;
+    planted.repose(|pose| DAffine3 { translation: 1000.0 * pose.translation, ..pose });
+    assert!(planted.cameras().finds(Kind::FarCamera).is_none(), "twice the usual distance is not far");
 
     let mut planted = Planted::new();
     planted.camera(10).pose.matrix3 *= DMat3::from_rotation_z(1.6);
