@@ -11,6 +11,9 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 /// Number of operations below which other threads are not worth their start: some 50 microseconds of work.
 const WORTHWHILE: usize = 1 << 20;
 
+/// Operations of a task, if its chunks allow.
+const TASK: usize = 1 << 16;
+
 /// Elements of a part of a loop: two or three such arrays of f32 fit a core's second-level cache.
 pub const PIECE: usize = 1 << 15;
 
@@ -131,8 +134,15 @@ pub fn chunks<T: Send, S: Send>(
         let mut scratch = scratch();
         out.chunks_mut(len).enumerate().for_each(|(i, chunk)| f(&mut scratch, i, chunk));
     } else {
+        // Small chunks share a task, so that it is worth its start.
+        let count = out.len().div_ceil(len);
+        let many = (TASK / work.div_ceil(count)).clamp(1, count);
         let free = Scratch(Mutex::default());
-        each_of(out.chunks_mut(len), |i, chunk| free.with_new(&scratch, |scratch| f(scratch, i, chunk)));
+        each_of(out.chunks_mut(many * len), |task, out| {
+            free.with_new(&scratch, |scratch| {
+                out.chunks_mut(len).enumerate().for_each(|(k, chunk)| f(scratch, task * many + k, chunk));
+            });
+        });
     }
 }
 

@@ -4,7 +4,7 @@
 use super::row_grad::{RowGrad, add_rows};
 use crate::error::ensure;
 use crate::{Grads, Op, Reads, ShapeError, Tape, Var, Vjp};
-use raygrad_tensor::parallel::{PIECE, chunks};
+use raygrad_tensor::parallel::chunks;
 use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
@@ -119,20 +119,6 @@ fn each_element(index: &[u32], inner: usize, mut f: impl FnMut(usize, usize)) {
     }
 }
 
-/// [`chunks`] of `len` elements, the blocks. A task gets enough blocks to be worth its start.
-fn in_blocks<T: Send, S: Send>(
-    out: &mut [T],
-    len: usize,
-    work: usize,
-    scratch: impl Fn() -> S + Sync,
-    f: &(dyn Fn(&mut S, usize, &mut [T]) + Sync),
-) {
-    let many = (PIECE / len.max(1)).max(1);
-    chunks(out, many * len, work, scratch, &|scratch: &mut S, i, out| {
-        out.chunks_mut(len).enumerate().for_each(|(k, out)| f(scratch, i * many + k, out));
-    });
-}
-
 impl<T: Scalar> Op<T> for Pick {
     fn name(&self) -> &'static str {
         self.method.names[0]
@@ -163,7 +149,7 @@ impl<T: Scalar> Op<T> for Pick {
             }
         };
         let work = out.len();
-        in_blocks(out.as_mut_slice(), to, work, || (), &block);
+        chunks(out.as_mut_slice(), to, work, || (), &block);
         out
     }
 
@@ -225,7 +211,7 @@ impl<T: Scalar> Op<T> for Put {
             out.iter_mut().zip(sums).for_each(|(out, sum)| *out = T::from_f64(*sum));
         };
         let work = 2 * x.len() + out.len();
-        in_blocks(out.as_mut_slice(), self.extent * inner, work, Vec::new, &block);
+        chunks(out.as_mut_slice(), self.extent * inner, work, Vec::new, &block);
         out
     }
 
@@ -366,6 +352,7 @@ impl<T: Scalar> Tape<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use raygrad_tensor::parallel::PIECE;
 
     #[test]
     fn pick_many_blocks_are_put_back() {
