@@ -170,7 +170,7 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
     let [density_work, color_work] = network(config, grid).map(|work| 2.0 * work);
     let lookups = (asked * grid.levels().len() * 8) as f64;
     println!(
-        "a tile of {} rays: {} samples marched, {asked} asked for a density, {kept} lit",
+        "a tile of {} rays: {} samples placed, {asked} density queries, {kept} visible",
         rays.len(),
         samples.len()
     );
@@ -194,7 +194,7 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
     row("density network", density, flop(work, density), Some(work / matrix));
     let rest = (forward - encode - density).max(0.0);
     let work = (density_work + color_work) * kept as f64;
-    row("lit samples: select, networks, composite, loss", rest, flop(work, rest), Some(work / matrix));
+    row("visible samples: select, networks, composite, loss", rest, flop(work, rest), Some(work / matrix));
     let backward = whole - forward;
     let work = 2.0 * (density_work + color_work) * kept as f64;
     row("backward", backward, flop(work, backward), Some(work / matrix));

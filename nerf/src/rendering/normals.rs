@@ -52,9 +52,9 @@ impl<T: Scalar> Model<T> {
             if sampled.samples.is_empty() {
                 return sampled.evaluations;
             }
-            let termination = viewing.tolerance.unwrap_or_else(|| self.sampler.tolerance()).early_stop_eps.into();
+            let early_stop_eps = viewing.tolerance.unwrap_or_else(|| self.sampler.tolerance()).early_stop_eps.into();
             let query = Query { position_grad: true, ..*query };
-            let seen = self.sampler.quadrature().render(&query, &sampled.samples, termination);
+            let seen = self.sampler.quadrature().render(&query, &sampled.samples, early_stop_eps);
             let normals = seen.rendered.accumulated_normals();
             out.iter_mut().zip(normals.as_slice()).for_each(|(out, value)| *out = value.to_f64() as f32);
             sampled.evaluations

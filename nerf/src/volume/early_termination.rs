@@ -24,19 +24,19 @@ const FIRST_ROUND: usize = 4;
 impl Quadrature {
     /// Renders `steps` by this rule, with early ray termination in two passes.
     ///
-    /// An unrecorded pass finds the visible samples, where the transmittance exceeds `termination`. A recorded pass
+    /// An unrecorded pass finds the visible samples, where the transmittance exceeds `early_stop_eps`. A recorded pass
     /// evaluates those and reuses the outputs of [cacheable](raygrad_autograd::Op::is_cacheable) operations. With a
-    /// `termination` of 0 there is only the second pass, on all samples. Dropped samples change a pixel by at most
-    /// `termination` times the range of colours.
+    /// `early_stop_eps` of 0 there is only the second pass, on all samples. Dropped samples change a pixel by at most
+    /// `early_stop_eps` times the range of colours.
     pub fn render<'t, T: Scalar>(
         self,
         query: &Query<'_, 't, T>,
         steps: &Samples<T>,
-        termination: f64,
+        early_stop_eps: f64,
     ) -> VisibleSamples<'t, T> {
         let tape = query.tape();
         if let Quadrature::Adaptive { tolerance } = self {
-            let (nodes, asked) = refine(query, steps, tolerance, termination);
+            let (nodes, asked) = refine(query, steps, tolerance, early_stop_eps);
             return VisibleSamples {
                 density_queries: asked,
                 visible: nodes.len(),
@@ -44,7 +44,7 @@ impl Quadrature {
             };
         }
         let nodes = self.nodes(steps);
-        if !(termination > 0.0) {
+        if !(early_stop_eps > 0.0) {
             return VisibleSamples {
                 density_queries: nodes.len(),
                 visible: nodes.len(),
@@ -54,10 +54,10 @@ impl Quadrature {
         // The unrecorded pass needs no variables.
         let plain = &Query { rays: None, position_grad: false, ..*query };
         let Visible { samples, memo, asked } = tape.no_grad(|| match self.has_intervals() {
-            false => visible(plain, &nodes, termination),
+            false => visible(plain, &nodes, early_stop_eps),
             true => {
                 let (density, memo) = tape.cache_outputs(|| plain.density(&nodes));
-                let (samples, rows) = self.visible_nodes(&density, &nodes, termination);
+                let (samples, rows) = self.visible_nodes(&density, &nodes, early_stop_eps);
                 let rows: Vec<[u32; 2]> = rows.into_iter().map(|row| [0, row]).collect();
                 Visible { samples, memo: gathered(vec![memo], &rows, &[nodes.len()], tape.pool()), asked: nodes.len() }
             }
@@ -86,9 +86,9 @@ struct Visible<T: Scalar> {
     asked: usize,
 }
 
-/// The samples with more than `termination` of the light left in front, found in rounds.
-fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, termination: f64) -> Visible<T> {
-    let (tape, mut rays) = (query.tape(), FrontToBack::new(samples, termination));
+/// The samples with more than `early_stop_eps` of the light left in front, found in rounds.
+fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, early_stop_eps: f64) -> Visible<T> {
+    let (tape, mut rays) = (query.tape(), FrontToBack::new(samples, early_stop_eps));
     // For each found sample: its index, and its position among the queries.
     let (mut found, mut memos, mut sizes) = (Vec::<(u32, [u32; 2])>::new(), vec![], vec![]);
     while let (Some(round), memo) = tape.cache_outputs(|| rays.round(query, FIRST_ROUND << memos.len())) {

@@ -178,16 +178,16 @@ mod tests {
         rays.push(&Ray { origin: DVec3::ZERO, direction: DVec3::Z }, [0.0, 4.0]);
         let steps = stratified(&rays, 4, &mut Jitter::Middle, &Pool::new());
         for rule in [Quadrature::Midpoint, Quadrature::PiecewiseLinear, Quadrature::Adaptive { tolerance: 1e-3 }] {
-            for termination in [0.0, 1e-9] {
+            for early_stop_eps in [0.0, 1e-9] {
                 let learned = |near: f64| {
                     let tape = Tape::new();
                     let bound = params.bind(&tape);
                     let query = Query { gradient_scaling_distance: near, ..Query::new(&Here, &bound) };
-                    let rendered = rule.render(&query, &steps, termination).rendered;
+                    let rendered = rule.render(&query, &steps, early_stop_eps).rendered;
                     rendered.weights.sum().grad(&[bound.vars()[0]])[0].item()
                 };
                 let (usual, less) = (learned(0.0), learned(1e6));
-                assert!(usual > 1e-3 && less.abs() < 1e-9, "{rule:?} {termination}: {usual} {less}");
+                assert!(usual > 1e-3 && less.abs() < 1e-9, "{rule:?} {early_stop_eps}: {usual} {less}");
             }
         }
     }

@@ -41,10 +41,10 @@ pub(crate) struct Round<'t, T: Scalar> {
 }
 
 impl<'a, T: Scalar> FrontToBack<'a, T> {
-    /// Follows rays until no more than `termination` of their light is left.
-    pub fn new(samples: &'a Samples<T>, termination: f64) -> Self {
+    /// Follows rays until no more than `early_stop_eps` of their light is left.
+    pub fn new(samples: &'a Samples<T>, early_stop_eps: f64) -> Self {
         // Without termination, rays end where f64 has no light left.
-        let opaque = -termination.max(5e-324).ln();
+        let opaque = -early_stop_eps.max(5e-324).ln();
         FrontToBack { samples, depths: vec![0.0; samples.segments.len()], opaque, passed: 0 }
     }
 

@@ -124,9 +124,9 @@ pub fn settings(step: f64) -> Vec<Setting> {
     for depth in [5e-4, 5e-3, 0.5, 2.0] {
         out.push(of("threshold", format!("depth {depth}"), Setting { cells: Cells::Depth(depth), ..base.clone() }));
     }
-    for termination in [0.0, 1e-4, 1e-2, 0.1] {
-        let limits = RayTolerance { early_stop_eps: termination, ..base.limits };
-        out.push(of("termination", format!("{termination}"), Setting { limits, ..base.clone() }));
+    for early_stop_eps in [0.0, 1e-4, 1e-2, 0.1] {
+        let limits = RayTolerance { early_stop_eps, ..base.limits };
+        out.push(of("early_stop_eps", format!("{early_stop_eps}"), Setting { limits, ..base.clone() }));
     }
     for color_budget in [0.0, 1e-4, 2e-2, 0.1] {
         let limits = RayTolerance { color_budget, ..base.limits };

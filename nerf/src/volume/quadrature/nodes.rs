@@ -164,7 +164,7 @@ impl Quadrature {
         self,
         density: &Density<'_, T>,
         nodes: &Samples<T>,
-        termination: f64,
+        early_stop_eps: f64,
     ) -> (Samples<T>, Vec<u32>) {
         let (intervals, pool) = (Intervals::between(nodes), density.value.tape().pool());
         let depth = intervals.optical_depth(density).1;
@@ -172,7 +172,7 @@ impl Quadrature {
         let mut delta = pool.full(&[nodes.len()], T::ZERO);
         let length = delta.as_mut_slice();
         for ((&node, &own), &light) in intervals.ends[0].iter().zip(intervals.length.as_slice()).zip(light.as_slice()) {
-            if light > T::from_f64(termination) {
+            if light > T::from_f64(early_stop_eps) {
                 length[node as usize] = own;
             }
         }
