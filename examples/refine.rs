@@ -54,7 +54,7 @@ fn disturbed(data: &Dataset, degrees: f64, share: f64, factor: f64) -> Dataset {
 
 /// How cameras as they were found are off the true ones.
 struct Found {
-    placement: SceneTransform,
+    transform: SceneTransform,
     degrees: f64,
     share: f64,
     focal: f64,
@@ -63,25 +63,25 @@ struct Found {
 fn compare(found: &[Camera], right: &Dataset) -> Option<Found> {
     let places = |cameras: &[Camera]| -> Vec<DVec3> { cameras.iter().map(|camera| camera.pose.translation).collect() };
     let truth: Vec<Camera> = right.frames.iter().map(|frame| frame.camera.clone()).collect();
-    let placement = SceneTransform::between(&places(&truth), &places(found))?;
+    let transform = SceneTransform::between(&places(&truth), &places(found))?;
     let (size, count) = ((right.bounds[1] - right.bounds[0]).max_element(), found.len() as f64);
     let (mut degrees, mut share, mut focal) = (0.0, 0.0, 0.0);
     for (found, right) in found.iter().zip(&truth) {
-        let placed = placement.camera(right);
+        let placed = transform.camera(right);
         let turn = found.pose.matrix3.transpose() * placed.pose.matrix3;
         let cosine = 0.5 * (turn.x_axis.x + turn.y_axis.y + turn.z_axis.z - 1.0);
         degrees += cosine.clamp(-1.0, 1.0).acos().to_degrees() / count;
-        share += found.pose.translation.distance(placed.pose.translation) / (placement.scale * size * count);
+        share += found.pose.translation.distance(placed.pose.translation) / (transform.scale * size * count);
         focal += 100.0 * (found.focal[0] / right.focal[0] - 1.0) / count;
     }
-    Some(Found { placement, degrees, share: 100.0 * share, focal })
+    Some(Found { transform, degrees, share: 100.0 * share, focal })
 }
 
 /// The mean PSNR of new views, from the true cameras moved to where the scene was found.
 fn score(model: &Model<f32>, views: &Dataset, found: &Found) -> f64 {
     let each = views.frames.iter().map(|frame| {
         let factor = 1.0 + 0.01 * found.focal;
-        let camera = found.placement.camera(&frame.camera);
+        let camera = found.transform.camera(&frame.camera);
         let camera = Camera { focal: camera.focal.map(|focal| factor * focal), ..camera };
         psnr(&model.render(&camera, [1.0; 3]).color, &frame.image.over([1.0; 3]))
     });

@@ -57,18 +57,18 @@ fn main() -> Result<()> {
     let budget = Budget::Time(Duration::from_secs_f64(seconds));
     let usual = Config { background: Background::White, ..Config::preset(Preset::Instant) };
     println!("way           steps  near (dB)  far (dB)  sky (dB)  all (dB)  seconds a view");
-    for (name, scope) in [
+    for (name, scene_type) in [
         ("bounded", SceneType::Bounded),
         ("contraction", SceneType::Unbounded),
         ("cascades", SceneType::Unbounded),
         ("ndc", SceneType::ForwardFacing),
     ] {
-        let leave_out = scope == SceneType::ForwardFacing && !window;
+        let leave_out = scene_type == SceneType::ForwardFacing && !window;
         if leave_out || argument("only").is_some_and(|only| only != name) {
             continue;
         }
-        let data = Dataset { scene_type: scope, ..train.clone() };
-        let mut config = usual.clone().for_budget(budget.samples(), data.pixels_per_side()).with_scene_type(scope);
+        let data = Dataset { scene_type, ..train.clone() };
+        let mut config = usual.clone().for_budget(budget.samples(), data.pixels_per_side()).with_scene_type(scene_type);
         if name == "contraction" {
             let proposal = ProposalConfig::default();
             config.sampler = SamplerConfig::new(proposal);

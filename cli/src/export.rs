@@ -132,19 +132,19 @@ pub fn run(args: &Args) -> Work<()> {
 fn refine(capture: &mut Capture, model: &Model<f32>, run: &Run) -> Result<usize> {
     let Some(refine) = &model.camera_optimizer else { return Ok(0) };
     let drift = refine.transform(&model.params).unwrap_or_default();
-    let placement = model.scene_box.transform;
+    let transform = model.scene_box.transform;
     let views = present(capture, Split::Train)?;
     check_trained(run, capture, &views, model.scene_box.frames)?;
     let trained: HashMap<String, usize> =
         views.iter().enumerate().map(|(number, view)| (view.field.clone(), number)).collect();
     for view in &mut capture.views {
-        let given = placement.camera(&view.camera);
+        let given = transform.camera(&view.camera);
         let found = match trained.get(&view.field) {
             Some(&number) => model.learned_camera(number, &given),
             None => model.other_camera(&given),
         };
         if found != given {
-            view.camera = placement.camera_back(&drift.camera_back(&found));
+            view.camera = transform.camera_back(&drift.camera_back(&found));
         }
     }
     Ok(trained.len())

@@ -30,8 +30,8 @@ pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: 
     if split == Split::Train {
         check_trained(run, &capture, &views, model.scene_box.frames)?;
     }
-    let placement = model.scene_box.transform;
-    let given: Vec<Camera> = views.iter().map(|view| placement.camera(&view.camera)).collect();
+    let transform = model.scene_box.transform;
+    let given: Vec<Camera> = views.iter().map(|view| transform.camera(&view.camera)).collect();
     let cameras = match split {
         Split::Train => given.iter().enumerate().map(|(i, given)| model.learned_camera(i, given)).collect(),
         _ => model.other_cameras(&given),
@@ -39,7 +39,7 @@ pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: 
     let photograph = |(view, camera): (&&View, Camera)| Photograph {
         name: view.name.clone(),
         camera,
-        bounds: bounds(view, placement.scale),
+        bounds: bounds(view, transform.scale),
     };
     Ok(views.iter().zip(cameras).map(photograph).collect())
 }

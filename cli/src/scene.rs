@@ -56,22 +56,22 @@ impl Scene {
     pub fn open(&self, asked: Option<SceneType>) -> Result<Opened> {
         let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, asked)) };
         let capture = Capture::read(folder)?;
-        let survey = capture.analyze_scene(asked)?;
-        Ok(Opened::new(self, Some((capture, survey)), asked))
+        let analysis = capture.analyze_scene(asked)?;
+        Ok(Opened::new(self, Some((capture, analysis)), asked))
     }
 
     /// Like [`open`](Self::open), with the scene transform of a model. `unbounded` is true for an unbounded scene.
     pub fn open_for(&self, extent: &SceneBox, unbounded: bool) -> Result<Opened> {
         let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, None)) };
-        let SceneBox { transform: placement, bounds, near_far: [near, far], ndc, .. } = *extent;
-        let scope = match (unbounded, ndc) {
+        let SceneBox { transform, bounds, near_far: [near, far], ndc, .. } = *extent;
+        let scene_type = match (unbounded, ndc) {
             (false, _) => SceneType::Bounded,
             (true, None) => SceneType::Unbounded,
             (true, Some(_)) => SceneType::ForwardFacing,
         };
         let reason = "as in training".to_owned();
-        let survey = SceneAnalysis { transform: placement, scene_type: scope, bounds, near, far, ndc, reason };
-        Ok(Opened::new(self, Some((Capture::read(folder)?, survey)), None))
+        let analysis = SceneAnalysis { transform, scene_type, bounds, near, far, ndc, reason };
+        Ok(Opened::new(self, Some((Capture::read(folder)?, analysis)), None))
     }
 
     /// The same scene with an absolute path.
@@ -125,12 +125,12 @@ impl Opened {
                     ..data
                 }
             }
-            Some((capture, survey)) => {
+            Some((capture, analysis)) => {
                 let (progress, words) = (Progress::new(), format!("{split} images read"));
                 let show = |done: usize, total: usize| progress.count(done, total, &words);
                 capture.load(
                     split,
-                    survey,
+                    analysis,
                     &LoadOptions { downscale, views, distances: self.depth, progress: &show },
                 )?
             }

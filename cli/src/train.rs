@@ -386,15 +386,15 @@ fn foresee_memory(trainer: &Trainer, data: &Dataset) -> Result<()> {
 
 fn describe(run: &Run, trainer: &Trainer, data: &Dataset, scene: &Opened) -> Result<()> {
     let (views, image) = (data.frames.len(), &data.frames[0].image);
-    if let Some((capture, survey)) = &scene.capture {
+    if let Some((capture, analysis)) = &scene.capture {
         let held_out = capture.present().count() - views;
         print(&format!(
             "capture  {}, {} of {} images found, {held_out} held out; {}: {}\n",
             capture.format,
             capture.present().count(),
             capture.views.len(),
-            survey.scene_type,
-            survey.reason
+            analysis.scene_type,
+            analysis.reason
         ))?;
     }
     print(&format!(

@@ -183,11 +183,11 @@ impl<'a> Watch<'a> {
     /// Returns a trainer that has diverged to a checkpoint and prints the `reason`. Training continues with lower
     /// learning rates. If this fails, prints the cause and returns false.
     pub fn retreat(&mut self, trainer: &mut Trainer, reason: &str) -> bool {
-        let (end, pace) = (trainer.stats().step, trainer.lr_scale());
+        let (end, lr_scale) = (trainer.stats().step, trainer.lr_scale());
         // A checkpoint may be good but about to diverge. So the second return uses the one before it.
         let back = self.keep().and_then(|()| checkpoint::step_back(self.run, self.back)).and_then(|()| {
             checkpoint::load(self.run, trainer)?;
-            trainer.set_lr_scale(SLOWER * pace);
+            trainer.set_lr_scale(SLOWER * lr_scale);
             checkpoint::save(self.run, trainer)?;
             self.cut(trainer)
         });

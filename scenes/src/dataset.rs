@@ -68,17 +68,8 @@ pub fn landscape_ahead(split: Split, width: usize) -> Dataset {
     Dataset { ndc: Ndc::around(&cameras, near).ok(), ..data }
 }
 
-fn dataset(frames: Vec<Frame>, bounds: [DVec3; 2], [near, far]: [f64; 2], scope: SceneType) -> Dataset {
-    Dataset {
-        frames,
-        bounds,
-        near,
-        far,
-        scene_type: scope,
-        ndc: None,
-        transform: SceneTransform::default(),
-        skipped: vec![],
-    }
+fn dataset(frames: Vec<Frame>, bounds: [DVec3; 2], [near, far]: [f64; 2], scene_type: SceneType) -> Dataset {
+    Dataset { frames, bounds, near, far, scene_type, ndc: None, transform: SceneTransform::default(), skipped: vec![] }
 }
 
 /// Frames with the images of some cameras.

@@ -30,7 +30,7 @@ static FILES: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| PHOTOGRAPHS.iter().map(|
 struct Planted {
     folder: TempDir,
     capture: Capture,
-    scope: Option<SceneType>,
+    scene_type: Option<SceneType>,
 }
 
 impl Planted {
@@ -44,7 +44,7 @@ impl Planted {
         });
         let capture =
             Capture::new(folder.path(), folder.path().join("transforms.json"), Format::Transforms, views.collect());
-        Planted { folder, capture, scope: None }
+        Planted { folder, capture, scene_type: None }
     }
 
     fn camera(&mut self, view: usize) -> &mut Camera {
@@ -69,16 +69,16 @@ impl Planted {
         self.capture.views[view].mask = Some(path);
     }
 
-    fn survey(&self) -> Option<SceneAnalysis> {
-        self.capture.analyze_scene(self.scope).ok()
+    fn analysis(&self) -> Option<SceneAnalysis> {
+        self.capture.analyze_scene(self.scene_type).ok()
     }
 
     fn cameras(&self) -> Report {
-        examine_cameras(&self.capture, self.survey().as_ref())
+        examine_cameras(&self.capture, self.analysis().as_ref())
     }
 
     fn report(&self) -> Report {
-        examine(&self.capture, self.survey().as_ref(), &DoctorOptions::default())
+        examine(&self.capture, self.analysis().as_ref(), &DoctorOptions::default())
     }
 }
 
@@ -350,7 +350,7 @@ fn doctor_finds_missing_parallax_and_gaps() {
     found(&planted.cameras(), Kind::CoverageGap, Note, &[], &[Kind::FewImages]);
 
     let mut planted = Planted::new();
-    planted.scope = Some(SceneType::Bounded);
+    planted.scene_type = Some(SceneType::Bounded);
     planted.camera(7).pose.translation *= 0.2;
     planted.camera(8).pose.matrix3 *= DMat3::from_rotation_y(3.0);
     let report = planted.cameras();

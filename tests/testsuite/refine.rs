@@ -65,13 +65,13 @@ fn errors(model: &Model<f32>, right: &Dataset, wrong: &Dataset) -> [f64; 2] {
         wrong.frames.iter().enumerate().map(|(i, frame)| model.learned_camera(i, &frame.camera)).collect();
     let place = |cameras: &[Camera]| -> Vec<DVec3> { cameras.iter().map(|camera| camera.pose.translation).collect() };
     let right_cameras: Vec<Camera> = right.frames.iter().map(|frame| frame.camera.clone()).collect();
-    let placement = SceneTransform::between(&place(&right_cameras), &place(&found)).unwrap();
+    let transform = SceneTransform::between(&place(&right_cameras), &place(&found)).unwrap();
     let size = (right.bounds[1] - right.bounds[0]).max_element();
     let each = found.iter().zip(&right_cameras).map(|(found, right)| {
-        let right = placement.camera(right);
+        let right = transform.camera(right);
         let turn = found.pose.matrix3.transpose() * right.pose.matrix3;
         let angle = (0.5 * (turn.x_axis.x + turn.y_axis.y + turn.z_axis.z - 1.0)).clamp(-1.0, 1.0).acos();
-        [angle.to_degrees(), found.pose.translation.distance(right.pose.translation) / (placement.scale * size)]
+        [angle.to_degrees(), found.pose.translation.distance(right.pose.translation) / (transform.scale * size)]
     });
     let sum = each.fold([0.0; 2], |[a, b], [c, d]| [a + c, b + d]);
     sum.map(|x| x / found.len() as f64)

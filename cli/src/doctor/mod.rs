@@ -60,13 +60,13 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     files.iter().try_for_each(|file| job.check(file))?;
     let capture = Capture::read(folder)?;
     // The analysis fails for a capture without extent; the report gives the reason.
-    let survey = capture.analyze_scene(args.scene_type).ok();
+    let analysis = capture.analyze_scene(args.scene_type).ok();
     make_folder(&args.out)?;
     let progress = Progress::new();
     let show = |done: usize, total: usize| progress.count(done, total, "images checked");
-    let report = examine(&capture, survey.as_ref(), &DoctorOptions { progress: &show, ..DoctorOptions::default() });
+    let report = examine(&capture, analysis.as_ref(), &DoctorOptions { progress: &show, ..DoctorOptions::default() });
     drop(progress);
-    let stage = Stage::new(&capture, survey.as_ref(), &report);
+    let stage = Stage::new(&capture, analysis.as_ref(), &report);
     let drawn = drawing::draw(&stage).map_err(|e| Error::file(&files[0], e))?;
     let page = page::page(&capture, &report, &stage, job.mark())?;
     files.iter().try_for_each(|file| job.check(file))?;
@@ -88,8 +88,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 /// Warns of problems with the cameras of a training scene, one line each.
 pub fn warn(scene: &Opened) {
-    let Some((capture, survey)) = &scene.capture else { return };
-    let Report { findings, .. } = examine_cameras(capture, Some(survey));
+    let Some((capture, analysis)) = &scene.capture else { return };
+    let Report { findings, .. } = examine_cameras(capture, Some(analysis));
     // Loading warns of absent images itself.
     let said = |finding: &Finding| finding.kind == FindingKind::ImagesAbsent;
     for Finding { kind, severity, what, .. } in findings.iter().filter(|finding| !said(finding)) {

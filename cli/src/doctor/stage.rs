@@ -46,8 +46,8 @@ pub struct Stage {
 
 impl Stage {
     /// The stage of a capture. Without an analysis, it uses the capture's coordinates.
-    pub fn new(capture: &Capture, survey: Option<&SceneAnalysis>, report: &Report) -> Self {
-        let placement = survey.map_or_else(SceneTransform::default, |survey| survey.transform);
+    pub fn new(capture: &Capture, analysis: Option<&SceneAnalysis>, report: &Report) -> Self {
+        let transform = analysis.map_or_else(SceneTransform::default, |analysis| analysis.transform);
         let flagged: HashSet<&String> = report
             .findings
             .iter()
@@ -55,11 +55,11 @@ impl Stage {
             .flat_map(|finding| &finding.views)
             .collect();
         let mut distances: Vec<f64> =
-            capture.views.iter().map(|view| placement.point(view.camera.pose.translation).length()).collect();
+            capture.views.iter().map(|view| transform.point(view.camera.pose.translation).length()).collect();
         distances.sort_by(f64::total_cmp);
         let usual = distances.get(distances.len() / 2).copied().filter(|distance| *distance > 0.0).unwrap_or(1.0);
         let cameras = capture.views.iter().map(|view| {
-            let camera = placement.camera(&view.camera);
+            let camera = transform.camera(&view.camera);
             let eye = camera.pose.translation;
             let [width, height] = [camera.width.max(1) as f64, camera.height.max(1) as f64];
             let [x, y] = [0, 1].map(|axis| (0.5 * [width, height][axis] / camera.focal[axis]).clamp(0.05, 1.5));
@@ -78,7 +78,8 @@ impl Stage {
         });
         let mut cameras: Vec<Pyramid> = cameras.collect();
         cameras.retain(|camera| camera.eye.is_finite());
-        let bounds = survey.map_or([DVec3::splat(-0.5 * usual), DVec3::splat(0.5 * usual)], |survey| survey.bounds);
+        let bounds =
+            analysis.map_or([DVec3::splat(-0.5 * usual), DVec3::splat(0.5 * usual)], |analysis| analysis.bounds);
         let [mut low, mut high] = bounds;
         for camera in &cameras {
             // Distant cameras are clamped, so that one outlier does not shrink all others.
@@ -87,10 +88,10 @@ impl Stage {
         }
         let centre = 0.5 * (low + high);
         let reach = 1.1 * (0.5 * (high - low).max_element() + LENGTH * usual);
-        let inside = capture.points.iter().map(|point| (placement.point(point.position), point.color));
+        let inside = capture.points.iter().map(|point| (transform.point(point.position), point.color));
         let inside = inside.filter(|(place, _)| (*place - centre).abs().max_element() < 1.5 * reach).collect();
         let (points, colors) = evenly_spaced(inside, POINTS).into_iter().unzip();
-        let bounded = survey.is_none_or(|survey| survey.scene_type == SceneType::Bounded);
+        let bounded = analysis.is_none_or(|analysis| analysis.scene_type == SceneType::Bounded);
         Stage { cameras, points, colors, bounds, bounded, centre, reach }
     }
 }

@@ -25,10 +25,8 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     if facts.points > 0 {
         rows.push(("points", facts.points.to_string()));
     }
-    if let Some(SceneLayout { scene_type: scope, reason, near, far, bounds: [low, high], scale, up, middle }) =
-        &facts.layout
-    {
-        rows.push(("scene type", format!("{scope}: {reason}")));
+    if let Some(SceneLayout { scene_type, reason, near, far, bounds: [low, high], scale, up, middle }) = &facts.layout {
+        rows.push(("scene type", format!("{scene_type}: {reason}")));
         rows.push(("near to far", format!("{near:.3} to {far:.3} scene units")));
         rows.push(("scene box", format!("{low:.2} to {high:.2} scene units")));
         rows.push(("scale", format!("{scale:.4} scene units per capture unit")));

@@ -17,11 +17,11 @@ pub fn of(capture: &Capture) -> Result<(Vec<[f64; 2]>, usize)> {
     if guessed == 0 {
         return Ok((found.into_iter().flatten().collect(), 0));
     }
-    let survey = capture.analyze_scene(None)?;
-    let placement = survey.transform;
-    let reach = survey.bounds[0].distance(survey.bounds[1]) * 0.5 / placement.scale;
-    let middle = placement.point_back(0.5 * (survey.bounds[0] + survey.bounds[1]));
-    let near = survey.near / placement.scale;
+    let analysis = capture.analyze_scene(None)?;
+    let transform = analysis.transform;
+    let reach = analysis.bounds[0].distance(analysis.bounds[1]) * 0.5 / transform.scale;
+    let middle = transform.point_back(0.5 * (analysis.bounds[0] + analysis.bounds[1]));
+    let near = analysis.near / transform.scale;
     let guess = |view: &View| {
         let far = view.camera.pose.translation.distance(middle) + reach;
         [near.min(0.5 * far), far]

@@ -116,8 +116,8 @@ impl Shown<'_> {
 }
 
 /// Unit normals as colours, in the capture's axes.
-pub fn facing(mut normals: Image, placement: &SceneTransform) -> Image {
-    let back = placement.rotation.transpose();
+pub fn facing(mut normals: Image, transform: &SceneTransform) -> Image {
+    let back = transform.rotation.transpose();
     for pixel in normals.data.chunks_exact_mut(3) {
         let normal = DVec3::new(pixel[0].into(), pixel[1].into(), pixel[2].into());
         let color = 0.5 + 0.5 * (back * normal).normalize_or_zero();
@@ -127,8 +127,8 @@ pub fn facing(mut normals: Image, placement: &SceneTransform) -> Image {
 }
 
 /// Depths of opaque pixels in capture units.
-fn depths(picture: &Render, camera: &Camera, placement: &SceneTransform) -> Depths {
-    Depths::new(&solid(&picture.depth, picture), camera, placement.scale.recip())
+fn depths(picture: &Render, camera: &Camera, transform: &SceneTransform) -> Depths {
+    Depths::new(&solid(&picture.depth, picture), camera, transform.scale.recip())
 }
 
 /// The image, with 0 where pixels are not opaque.
@@ -165,8 +165,8 @@ mod tests {
     fn normals_and_depths_use_capture_units() {
         // The capture's x, y and z axes are the scene's y, z and x axes, with scale 2.
         let rotation = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
-        let placement = SceneTransform { rotation, scale: 2.0, origin: DVec3::ONE };
-        let colors = facing(image(3, &[0.0, 0.7, 0.0, 0.0, 0.0, -0.3, 0.0, 0.0, 0.0]), &placement);
+        let transform = SceneTransform { rotation, scale: 2.0, origin: DVec3::ONE };
+        let colors = facing(image(3, &[0.0, 0.7, 0.0, 0.0, 0.0, -0.3, 0.0, 0.0, 0.0]), &transform);
         assert_eq!(colors.data, [1.0, 0.5, 0.5, 0.5, 0.0, 0.5, 0.5, 0.5, 0.5]);
         let picture = Render {
             color: image(3, &[0.0; 9]),
@@ -175,7 +175,7 @@ mod tests {
             evaluations: Evaluations::default(),
         };
         let camera = Camera::from_angle(3, 1, 1e-6, DAffine3::IDENTITY);
-        let npy = depths(&picture, &camera, &placement).to_npy();
+        let npy = depths(&picture, &camera, &transform).to_npy();
         let found = npy[npy.len() - 12..].chunks_exact(4).map(|x| f32::from_le_bytes(x.try_into().unwrap()));
         assert_eq!(found.collect::<Vec<_>>(), [0.0, 3.0, 3.0], "of what is solid, in the capture's units");
     }

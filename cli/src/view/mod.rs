@@ -165,14 +165,14 @@ fn taken(run: &Run, model: &Model<f32>, photos: Option<&PhotoCache>) -> Taken {
 }
 
 /// Maps scene coordinates to capture coordinates: the inverse of the learned transform, then of the scene transform.
-fn to_capture(placement: &SceneTransform, learned: &SceneTransform) -> DAffine3 {
-    inverse(placement) * inverse(learned)
+fn to_capture(transform: &SceneTransform, learned: &SceneTransform) -> DAffine3 {
+    inverse(transform) * inverse(learned)
 }
 
 /// The inverse of a scene transform.
-fn inverse(placement: &SceneTransform) -> DAffine3 {
-    let turn = placement.rotation.transpose() * DMat3::from_diagonal(DVec3::splat(placement.scale.recip()));
-    DAffine3 { matrix3: turn, translation: placement.origin }
+fn inverse(transform: &SceneTransform) -> DAffine3 {
+    let turn = transform.rotation.transpose() * DMat3::from_diagonal(DVec3::splat(transform.scale.recip()));
+    DAffine3 { matrix3: turn, translation: transform.origin }
 }
 
 #[cfg(test)]
@@ -181,12 +181,12 @@ mod tests {
 
     #[test]
     fn to_capture_inverts_both_transforms() {
-        let placement =
+        let transform =
             SceneTransform { rotation: DMat3::from_rotation_z(0.7), scale: 2.5, origin: DVec3::new(1.0, -2.0, 0.5) };
         let learned =
             SceneTransform { rotation: DMat3::from_rotation_x(-0.3), scale: 0.8, origin: DVec3::new(0.1, 0.4, -0.2) };
         let point = DVec3::new(3.0, 4.0, -5.0);
-        let found = to_capture(&placement, &learned).transform_point3(learned.point(placement.point(point)));
+        let found = to_capture(&transform, &learned).transform_point3(learned.point(transform.point(point)));
         assert!(found.abs_diff_eq(point, 1e-12), "{found}");
     }
 }

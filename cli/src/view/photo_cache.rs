@@ -57,7 +57,7 @@ impl PhotoCache {
         let scene = run.scene(scene)?.clone();
         let capture = builtin::capture(&scene, None, None)?;
         let width = if scene == Scene::Landscape { LANDSCAPE_SIZE[0] } else { EMBEDDED_SIZE };
-        let placement = run.config.scene_box.transform;
+        let transform = run.config.scene_box.transform;
         let mut entries = vec![];
         for split in Split::ALL {
             // A capture may lack splits.
@@ -72,11 +72,11 @@ impl PhotoCache {
                 check_trained(run, &capture, &views, run.config.scene_box.frames)?;
             }
             entries.extend(views.into_iter().enumerate().map(|(number, view)| {
-                let given = placement.camera(&view.camera);
+                let given = transform.camera(&view.camera);
                 Entry { split, number, view: view.clone(), given }
             }));
         }
-        let points = best(&capture.points).map(|point| (placement.point(point.position), point.color)).collect();
+        let points = best(&capture.points).map(|point| (transform.point(point.position), point.color)).collect();
         let downscale = run.config.downscale;
         let (kept, made) = (Cache::new(KEPT), Mutex::default());
         Ok(PhotoCache { capture, scene, downscale, entries, points, kept, made, width })

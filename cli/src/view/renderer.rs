@@ -108,7 +108,7 @@ impl Renderer {
                 *rate = rate.min(speed(parts.asked(), job.spent));
                 return true;
             }
-            parts.pace(spent);
+            parts.lr_scale(spent);
             if !whole || parts.is_whole() {
                 break;
             }

@@ -105,7 +105,7 @@ impl RowTiles {
 
     /// Sets the rows of the next tile from the time of the last one. It grows at most twofold, as later rows may be
     /// slower.
-    pub fn pace(&mut self, spent: Duration) {
+    pub fn lr_scale(&mut self, spent: Duration) {
         let fitting = self.band as f64 * PIECE / spent.as_secs_f64().max(1e-4);
         self.band = (fitting as usize).clamp(1, 2 * self.band);
     }
@@ -122,9 +122,9 @@ fn normals(
     camera: &Camera,
     viewing: &RenderOptions<'_>,
     picture: &Render,
-    placement: &SceneTransform,
+    transform: &SceneTransform,
 ) -> Option<Image> {
-    let colors = facing(model.normals_cancellable(camera, viewing)?, placement);
+    let colors = facing(model.normals_cancellable(camera, viewing)?, transform);
     Some(over(&colors, &picture.opacity, viewing.background))
 }
 
@@ -191,7 +191,7 @@ pub mod tests {
         let paced = |milliseconds: u64| {
             let color = Image::new(1, 1, 3);
             let mut parts = RowTiles { camera: camera.clone(), truth: None, color, rows: 0, band: 8 };
-            parts.pace(Duration::from_millis(milliseconds));
+            parts.lr_scale(Duration::from_millis(milliseconds));
             parts.band
         };
         // At most twice as many rows, half as many after a tile of twice the time, and at least one.

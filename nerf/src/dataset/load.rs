@@ -189,13 +189,13 @@ impl Capture {
         self.named(view, open(path, &view.camera))
     }
 
-    /// Reads the images of a split, in parallel, and maps their cameras to the scene by `survey`.
+    /// Reads the images of a split, in parallel, and maps their cameras to the scene by `analysis`.
     ///
     /// # Errors
     /// If none of the split's images exists, an image cannot be decoded or has another aspect ratio than its camera, or
     /// `downscale` or `views` is 0. Which of several errors is reported does not depend on timing. Single absent images
     /// are not an error: see [`Dataset::skipped`].
-    pub fn load(&self, split: Split, survey: &SceneAnalysis, reading: &LoadOptions<'_>) -> Result<Dataset> {
+    pub fn load(&self, split: Split, analysis: &SceneAnalysis, reading: &LoadOptions<'_>) -> Result<Dataset> {
         reading.check()?;
         let (present, absent): (Vec<&View>, Vec<&View>) =
             self.split(split)?.into_iter().partition(|view| view.image.is_some());
@@ -214,18 +214,18 @@ impl Capture {
         let plans = plans.into_iter().collect::<Result<Vec<_>>>()?;
         let (done, total, lit) = (AtomicUsize::new(0), plans.len(), Lit::default());
         let frames = parallel::collect(total, |i| {
-            let frame = plans[i].frame(&survey.transform, &lit, reading.distances);
+            let frame = plans[i].frame(&analysis.transform, &lit, reading.distances);
             (reading.progress)(done.fetch_add(1, Ordering::Relaxed) + 1, total);
             self.named(plans[i].view, frame)
         });
         Ok(Dataset {
             frames: frames.into_iter().collect::<Result<_>>()?,
-            bounds: survey.bounds,
-            near: survey.near,
-            ndc: survey.ndc,
-            far: survey.far,
-            scene_type: survey.scene_type,
-            transform: survey.transform,
+            bounds: analysis.bounds,
+            near: analysis.near,
+            ndc: analysis.ndc,
+            far: analysis.far,
+            scene_type: analysis.scene_type,
+            transform: analysis.transform,
             skipped: absent.into_iter().map(|view| view.name.clone()).collect(),
         })
     }
@@ -255,7 +255,7 @@ impl<'a> Plan<'a> {
         Ok(Plan { view, path, size, to })
     }
 
-    fn frame(&self, placement: &SceneTransform, lit: &Lit, is_measured: bool) -> Result<Frame> {
+    fn frame(&self, transform: &SceneTransform, lit: &Lit, is_measured: bool) -> Result<Frame> {
         let Plan { view, path, size, to } = self;
         let photo = Photo::open(path, Some(*size))?;
         let image = if [photo.width, photo.height] == *to { photo } else { photo.resized(*to) };
@@ -273,9 +273,9 @@ impl<'a> Plan<'a> {
                 "has no usable pixel: all are masked or outside of the lens; correct its mask or remove it",
             ));
         }
-        let camera = placement.camera(&camera);
+        let camera = transform.camera(&camera);
         let measured = view.depth.as_ref().filter(|_| is_measured);
-        let distances = measured.map(|(path, unit)| distances(path, unit * placement.scale, &camera)).transpose()?;
+        let distances = measured.map(|(path, unit)| distances(path, unit * transform.scale, &camera)).transpose()?;
         Ok(Frame { name: view.name.clone(), camera, image, mask, distances })
     }
 }

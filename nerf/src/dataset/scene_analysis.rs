@@ -73,7 +73,7 @@ impl SceneAnalysis {
             return Err(Error::field(&capture.file, &first.field, what));
         }
         // Opaque images show a background, wherever their cameras are.
-        let bounded = asked.map_or(empty.is_some(), |scope| scope == SceneType::Bounded);
+        let bounded = asked.map_or(empty.is_some(), |scene_type| scene_type == SceneType::Bounded);
         if capture.format == Format::Blender && bounded && conventional(&cameras) {
             return Ok(SceneAnalysis {
                 transform: SceneTransform::default(),
@@ -85,8 +85,8 @@ impl SceneAnalysis {
                 reason: "the NeRF-synthetic convention: all within 1.5 units of the origin".to_owned(),
             });
         }
-        let (scope, reason) = match (asked, empty) {
-            (Some(scope), _) => (scope, "as requested"),
+        let (scene_type, reason) = match (asked, empty) {
+            (Some(scene_type), _) => (scene_type, "as requested"),
             (None, Some(why)) => (SceneType::Bounded, why),
             (None, None) => {
                 if Ndc::around(cameras.iter().copied(), 1.0).is_ok() {
@@ -108,13 +108,13 @@ impl SceneAnalysis {
             let what = "has all cameras in one place, so the scene has no scale; check the positions of the poses";
             return Err(Error::file(&capture.file, what));
         }
-        let half = match scope {
+        let half = match scene_type {
             SceneType::Bounded => half_width(&cameras, middle),
             SceneType::Unbounded | SceneType::ForwardFacing => inner,
         };
-        let placement = SceneTransform { rotation: upright(&cameras), scale: HALF_BOX / half, origin: middle };
+        let transform = SceneTransform { rotation: upright(&cameras), scale: HALF_BOX / half, origin: middle };
         let bounds = [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)];
-        let [near, far] = match scope {
+        let [near, far] = match scene_type {
             SceneType::Bounded => {
                 let distances = || cameras.iter().map(|camera| camera.pose.translation.distance(middle));
                 let reach = 3.0_f64.sqrt() * half;
@@ -128,15 +128,15 @@ impl SceneAnalysis {
                 [near.min(0.5 * distance), FAR_SIDES * 2.0 * half]
             }
         };
-        let [near, far] = [near, far].map(|length| length * placement.scale);
-        let ndc = match scope {
+        let [near, far] = [near, far].map(|length| length * transform.scale);
+        let ndc = match scene_type {
             SceneType::ForwardFacing => {
-                let placed: Vec<Camera> = cameras.iter().map(|camera| placement.camera(camera)).collect();
+                let placed: Vec<Camera> = cameras.iter().map(|camera| transform.camera(camera)).collect();
                 Some(Ndc::around(&placed, near)?)
             }
             SceneType::Bounded | SceneType::Unbounded => None,
         };
-        Ok(SceneAnalysis { transform: placement, scene_type: scope, bounds, near, far, ndc, reason })
+        Ok(SceneAnalysis { transform, scene_type, bounds, near, far, ndc, reason })
     }
 }
 

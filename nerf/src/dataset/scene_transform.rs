@@ -114,8 +114,8 @@ mod tests {
             assert!((found.scale - 0.3).abs() < 1e-12 && found.rotation.abs_diff_eq(rotation, 1e-12));
             // For points that no similarity fits, a least-squares solution: no small change improves it.
             to.iter_mut().enumerate().for_each(|(i, point)| point.x += 0.1 * (5.0 * i as f64).cos());
-            let error = |placement: &SceneTransform| -> f64 {
-                from.iter().zip(&to).map(|(a, b)| placement.point(*a).distance_squared(*b)).sum()
+            let error = |transform: &SceneTransform| -> f64 {
+                from.iter().zip(&to).map(|(a, b)| transform.point(*a).distance_squared(*b)).sum()
             };
             let found = SceneTransform::between(&from, &to).unwrap();
             for sign in [-1e-4, 1e-4] {
@@ -141,25 +141,25 @@ mod tests {
     #[test]
     fn transformed_cameras_see_the_same() {
         let rotation = DMat3::from_quat(DQuat::from_rotation_x(0.3) * DQuat::from_rotation_z(2.0));
-        let placement = SceneTransform { rotation, scale: 0.2, origin: DVec3::new(500_000.0, -3.0, 7.0) };
-        placement.check().unwrap();
-        let pose = Camera::look_at(DVec3::new(500_001.0, 2.0, 3.0), placement.origin, DVec3::Z);
+        let transform = SceneTransform { rotation, scale: 0.2, origin: DVec3::new(500_000.0, -3.0, 7.0) };
+        transform.check().unwrap();
+        let pose = Camera::look_at(DVec3::new(500_001.0, 2.0, 3.0), transform.origin, DVec3::Z);
         let camera = Camera::from_angle(40, 30, 0.8, pose);
-        let placed = placement.camera(&camera);
-        let point = placement.origin + DVec3::new(0.1, -0.3, 0.2);
-        let (before, after) = (camera.pixel_of(point).unwrap(), placed.pixel_of(placement.point(point)).unwrap());
+        let placed = transform.camera(&camera);
+        let point = transform.origin + DVec3::new(0.1, -0.3, 0.2);
+        let (before, after) = (camera.pixel_of(point).unwrap(), placed.pixel_of(transform.point(point)).unwrap());
         assert!((0..2).all(|i| (before[i] - after[i]).abs() < 1e-7), "{before:?} {after:?}");
-        assert!(placement.point_back(placement.point(point)).distance(point) < 1e-9);
-        assert!(placement.camera_back(&placed).pose.abs_diff_eq(camera.pose, 1e-9));
+        assert!(transform.point_back(transform.point(point)).distance(point) < 1e-9);
+        assert!(transform.camera_back(&placed).pose.abs_diff_eq(camera.pose, 1e-9));
         assert!(
-            (placed.pose.translation.length() - 0.2 * camera.pose.translation.distance(placement.origin)).abs() < 1e-9
+            (placed.pose.translation.length() - 0.2 * camera.pose.translation.distance(transform.origin)).abs() < 1e-9
         );
         for wrong in [
-            SceneTransform { scale: 0.0, ..placement },
-            SceneTransform { scale: f64::NAN, ..placement },
-            SceneTransform { rotation: 1.1 * rotation, ..placement },
-            SceneTransform { rotation: -rotation, ..placement },
-            SceneTransform { origin: DVec3::INFINITY, ..placement },
+            SceneTransform { scale: 0.0, ..transform },
+            SceneTransform { scale: f64::NAN, ..transform },
+            SceneTransform { rotation: 1.1 * rotation, ..transform },
+            SceneTransform { rotation: -rotation, ..transform },
+            SceneTransform { origin: DVec3::INFINITY, ..transform },
         ] {
             assert!(wrong.check().unwrap_err().to_string().starts_with("`transform`"));
         }

@@ -24,7 +24,7 @@ const ROLL: f64 = 30.0;
 const GAP: f64 = 120.0;
 
 /// Adds findings about all cameras that have images.
-pub(super) fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &mut Findings) {
+pub(super) fn examine(capture: &Capture, analysis: Option<&SceneAnalysis>, findings: &mut Findings) {
     let views: Vec<&View> = capture.present().collect();
     few(capture, &views, findings);
     if views.len() < 2 {
@@ -55,13 +55,13 @@ pub(super) fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, finding
     pairs(&views, &places, focus.map_or(size[0], |focus| focus.distance.max(size[0])), size[0], findings);
     far_cameras(&views, &places, size[0], findings);
     scale(capture, &places, size[0], findings);
-    if let Some(survey) = survey {
-        let up = survey.transform.rotation.transpose() * DVec3::Z;
+    if let Some(analysis) = analysis {
+        let up = analysis.transform.rotation.transpose() * DVec3::Z;
         roll(&views, up, findings);
         if let Some(focus) = focus.filter(Focus::is_inward) {
             coverage(&places, focus, up, findings);
         }
-        in_the_box(&views, survey, findings);
+        in_the_box(&views, analysis, findings);
     }
 }
 
@@ -214,22 +214,22 @@ fn coverage(places: &[DVec3], focus: Focus, up: DVec3, findings: &mut Findings) 
     }
 }
 
-fn in_the_box(views: &[&View], survey: &SceneAnalysis, findings: &mut Findings) {
+fn in_the_box(views: &[&View], analysis: &SceneAnalysis, findings: &mut Findings) {
     /// Rays along each side of an image; the second number applies if all of the first miss, since a small box may lie
     /// between them.
     const RAYS: [usize; 2] = [12, 200];
-    if survey.scene_type != SceneType::Bounded {
+    if analysis.scene_type != SceneType::Bounded {
         return;
     }
-    let [low, high] = survey.bounds;
-    let placed = |view: &View| survey.transform.camera(&view.camera);
+    let [low, high] = analysis.bounds;
+    let placed = |view: &View| analysis.transform.camera(&view.camera);
     let inside = |view: &&&View| {
         let eye = placed(view).pose.translation;
         eye.cmpge(low).all() && eye.cmple(high).all()
     };
     let misses = |view: &&&View| {
         let camera = placed(view);
-        let meets = |rays: usize| camera.meets(survey.bounds, [survey.near, survey.far], [rays; 2]);
+        let meets = |rays: usize| camera.meets(analysis.bounds, [analysis.near, analysis.far], [rays; 2]);
         camera.width > 0 && !RAYS.into_iter().any(meets)
     };
     findings.about(Kind::CameraInBox, views.iter().filter(inside).copied(), &[]);

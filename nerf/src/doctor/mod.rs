@@ -42,18 +42,18 @@ impl Default for DoctorOptions<'_> {
 
 /// Examines poses, lenses and image headers, without reading pixels.
 ///
-/// `survey` comes from [`Capture::analyze_scene`], which fails for captures without a size. Without it, checks of the
+/// `analysis` comes from [`Capture::analyze_scene`], which fails for captures without a size. Without it, checks of the
 /// up direction and the scene box are left out.
-pub fn examine_cameras(capture: &Capture, survey: Option<&SceneAnalysis>) -> Report {
+pub fn examine_cameras(capture: &Capture, analysis: Option<&SceneAnalysis>) -> Report {
     let mut findings = Findings::default();
-    let facts = without_pixels(capture, survey, &mut findings);
+    let facts = without_pixels(capture, analysis, &mut findings);
     Report { facts, findings: findings.sorted() }
 }
 
 /// Examines everything that [`examine_cameras`] does and reads all images, in parallel.
-pub fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, options: &DoctorOptions<'_>) -> Report {
+pub fn examine(capture: &Capture, analysis: Option<&SceneAnalysis>, options: &DoctorOptions<'_>) -> Report {
     let mut findings = Findings::default();
-    let mut facts = without_pixels(capture, survey, &mut findings);
+    let mut facts = without_pixels(capture, analysis, &mut findings);
     let looks = look::look_at_all(capture, options.progress);
     pixels::unreadable(&looks, &mut findings);
     let seen: Vec<Seen<'_>> =
@@ -64,7 +64,7 @@ pub fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, options: &Doct
     Report { facts, findings: findings.sorted() }
 }
 
-fn without_pixels(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &mut Findings) -> Facts {
+fn without_pixels(capture: &Capture, analysis: Option<&SceneAnalysis>, findings: &mut Findings) -> Facts {
     let absent: Vec<&View> = capture.views.iter().filter(|view| view.image.is_none()).collect();
     let all = absent.len() == capture.views.len();
     if let Some(finding) = findings.about(FindingKind::ImagesAbsent, absent, &[&capture.views.len()])
@@ -73,7 +73,7 @@ fn without_pixels(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &
         finding.severity = Severity::Error;
     }
     single::examine(capture, findings);
-    layout::examine(capture, survey, findings);
+    layout::examine(capture, analysis, findings);
     let resolutions = pixels::sizes(capture, findings)
         .into_iter()
         .map(|([width, height], images)| Resolution { width, height, images })
@@ -98,15 +98,15 @@ fn without_pixels(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &
         field_of_view: range(sized().map(|camera| single::field_of_view(camera, 0)).collect()),
         lenses,
         points: capture.points.len(),
-        layout: survey.map(|survey| SceneLayout {
-            scene_type: survey.scene_type,
-            reason: survey.reason.clone(),
-            near: survey.near,
-            far: survey.far,
-            bounds: survey.bounds,
-            scale: survey.transform.scale,
-            up: survey.transform.rotation.transpose() * DVec3::Z,
-            middle: survey.transform.origin,
+        layout: analysis.map(|analysis| SceneLayout {
+            scene_type: analysis.scene_type,
+            reason: analysis.reason.clone(),
+            near: analysis.near,
+            far: analysis.far,
+            bounds: analysis.bounds,
+            scale: analysis.transform.scale,
+            up: analysis.transform.rotation.transpose() * DVec3::Z,
+            middle: analysis.transform.origin,
         }),
         agreement: None,
     }

@@ -24,9 +24,9 @@ impl From<Mesh> for ColoredMesh {
 
 impl ColoredMesh {
     /// Maps scene coordinates to those of the capture.
-    pub fn into_capture(mut self, placement: &SceneTransform) -> Self {
-        self.mesh.positions.iter_mut().for_each(|place| *place = placement.point_back(*place));
-        let back = placement.rotation.transpose();
+    pub fn into_capture(mut self, transform: &SceneTransform) -> Self {
+        self.mesh.positions.iter_mut().for_each(|place| *place = transform.point_back(*place));
+        let back = transform.rotation.transpose();
         self.normals.iter_mut().for_each(|normal| *normal = back * *normal);
         self
     }

@@ -265,8 +265,8 @@ impl Config {
     /// It doubles the resolution of a hash grid and adds a [distortion loss](DistortionConfig) against fog. It
     /// overrides the steps of [`for_budget`](Self::for_budget). Figures are in docs/benchmarks/results.md, section
     /// Captures.
-    pub fn with_scene_type(mut self, scope: SceneType) -> Self {
-        let before = std::mem::replace(&mut self.unbounded, scope.is_unbounded());
+    pub fn with_scene_type(mut self, scene_type: SceneType) -> Self {
+        let before = std::mem::replace(&mut self.unbounded, scene_type.is_unbounded());
         if before == self.unbounded {
             return self;
         }

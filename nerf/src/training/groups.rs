@@ -85,16 +85,16 @@ impl Groups {
         self.adam.load_state(params, &state).map_err(failed)
     }
 
-    /// Updates the parameters at `fraction` of the run, with `pace` times the learning rates of their schedules; see
+    /// Updates the parameters at `fraction` of the run, with `lr_scale` times the learning rates of their schedules; see
     /// [`Optimizer::update`].
     pub fn update(
         &mut self,
         params: &mut Params<f32>,
         grads: &[Gradient<f32>],
         fraction: f64,
-        pace: f64,
+        lr_scale: f64,
     ) -> UpdateReport {
-        self.adam.update_groups(params, grads, |group| pace * self.schedules[group].lr(fraction))
+        self.adam.update_groups(params, grads, |group| lr_scale * self.schedules[group].lr(fraction))
     }
 }
 

@@ -31,7 +31,7 @@ struct Counts {
     collapses: u32,
     /// The lr scale.
     #[serde(default = "one")]
-    pace: f64,
+    lr_scale: f64,
     /// The share of detail of the fields.
     #[serde(default = "one")]
     detail: f64,
@@ -89,7 +89,7 @@ impl Trainer {
             elapsed: self.elapsed,
             batch: self.batch,
             collapses: self.collapses,
-            pace: self.pace,
+            lr_scale: self.lr_scale,
             detail: self.model.detail(),
             groups: 1,
             settings: params.ids().map(setting).collect(),
@@ -131,8 +131,8 @@ impl Trainer {
         if !(1..=MOST_RAYS).contains(&counts.batch) {
             return Err(failed(format!("has {} rays per step; use 1 to {MOST_RAYS}", counts.batch)));
         }
-        if !(counts.pace >= 0.0 && counts.pace.is_finite()) {
-            return Err(failed(format!("has an lr scale of {}; use a finite number of at least 0", counts.pace)));
+        if !(counts.lr_scale >= 0.0 && counts.lr_scale.is_finite()) {
+            return Err(failed(format!("has an lr scale of {}; use a finite number of at least 0", counts.lr_scale)));
         }
         for Setting { name, frozen, lazy, rate, decay } in &counts.settings {
             let is_own = |other: &str| other == name;
@@ -156,8 +156,9 @@ impl Trainer {
         let mut groups = Groups::new(&model.config, &model.params)?;
         groups.load_state(&model.params, &remembered)?;
         (self.model, self.groups) = (model, groups);
-        let Counts { stats, elapsed, batch, collapses, pace, .. } = counts;
-        (self.done, self.elapsed, self.batch, self.collapses, self.pace) = (stats, elapsed, batch, collapses, pace);
+        let Counts { stats, elapsed, batch, collapses, lr_scale, .. } = counts;
+        (self.done, self.elapsed, self.batch, self.collapses, self.lr_scale) =
+            (stats, elapsed, batch, collapses, lr_scale);
         Ok(())
     }
 }
@@ -238,7 +239,7 @@ mod tests {
         let state = trainer.state().unwrap();
         let mut later = self::trainer();
         later.load_state(&state).unwrap();
-        assert_eq!((later.collapses, later.done.restarts, later.batch, later.pace), (2, 3, 512, 0.125));
+        assert_eq!((later.collapses, later.done.restarts, later.batch, later.lr_scale), (2, 3, 512, 0.125));
         assert_eq!((later.elapsed, later.done.step), (trainer.elapsed, 0));
         assert!([later.done.loss, later.done.psnr, later.done.opacity].iter().all(|x| x.is_nan()), "{:?}", later.done);
     }
@@ -277,7 +278,7 @@ mod tests {
             (written(&|counts| counts.batch = usize::MAX), "rays per step; use 1 to 1048576"),
             (written(&|counts| counts.settings[0].rate = -1.0), "has an lr scale of -1"),
             (written(&|counts| counts.settings[1].decay = -2.0), "a weight decay scale of -2"),
-            (written(&|counts| counts.pace = -1.0), "has an lr scale of -1; use a finite number of at least 0"),
+            (written(&|counts| counts.lr_scale = -1.0), "has an lr scale of -1; use a finite number of at least 0"),
             (written(&|counts| counts.groups = 9), "lacks a part of the optimizer's state"),
             (written(&|counts| counts.groups = 0), "groups"),
             (written(&|counts| counts.extent.unit *= 2.0), "another configuration"),
@@ -286,7 +287,7 @@ mod tests {
         ];
         // Zeros are valid numbers of a run.
         let still = written(&|counts| {
-            (counts.settings[0].rate, counts.settings[1].decay, counts.pace, counts.detail) = (0.0, 0.0, 0.0, 0.0);
+            (counts.settings[0].rate, counts.settings[1].decay, counts.lr_scale, counts.detail) = (0.0, 0.0, 0.0, 0.0);
         });
         let before = trainer.state().unwrap();
         for (state, expected) in &states {
@@ -295,7 +296,7 @@ mod tests {
         }
         assert!(trainer.state().unwrap() == before);
         trainer.load_state(&still).unwrap();
-        assert_eq!((trainer.pace, trainer.model.detail()), (0.0, 0.0));
+        assert_eq!((trainer.lr_scale, trainer.model.detail()), (0.0, 0.0));
         trainer.load_state(&before).unwrap();
     }
 

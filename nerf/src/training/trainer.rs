@@ -43,7 +43,7 @@ pub struct Trainer {
     /// Collapsed models of this run.
     pub(super) collapses: u32,
     /// The lr scale.
-    pub(super) pace: f64,
+    pub(super) lr_scale: f64,
     pub(super) done: StepStats,
 }
 
@@ -138,7 +138,7 @@ impl Trainer {
             clock: Box::new(clock),
             elapsed: Duration::ZERO,
             collapses: 0,
-            pace: 1.0,
+            lr_scale: 1.0,
             done: StepStats { restarts, ..StepStats::default() },
         };
         trainer.prepare();
@@ -205,7 +205,7 @@ impl Trainer {
         let draw = self.draw(fraction);
         let number = draw.number;
         let step = tiles.differentiate(&self.model.params, draw.tiles(), |which, params, ()| draw.loss(which, params));
-        let report = self.groups.update(&mut self.model.params, &step.grads, fraction, self.pace);
+        let report = self.groups.update(&mut self.model.params, &step.grads, fraction, self.lr_scale);
         tiles.take_back(step.grads);
         self.tiles = tiles;
         if number.is_multiple_of(TRIM_EVERY) {
@@ -228,7 +228,7 @@ impl Trainer {
             psnr: psnr_from_mse(work.error / values),
             opacity: work.opacity / self.batch as f64,
             occupied: self.done.occupied,
-            lr: self.pace * self.model.config.schedule.lr(fraction),
+            lr: self.lr_scale * self.model.config.schedule.lr(fraction),
             non_finite: self.done.non_finite + report.skipped as u64,
             // A network may turn NaN into gradients of 0, which still move parameters.
             non_finite_steps: if report.has_only_non_finite() || !work.loss.is_finite() {
@@ -263,7 +263,7 @@ impl Trainer {
 
     /// Returns the lr scale, initially 1.
     pub fn lr_scale(&self) -> f64 {
-        self.pace
+        self.lr_scale
     }
 
     /// Sets the lr scale, which multiplies all learning rates from the next step on. It is part of the
@@ -271,9 +271,9 @@ impl Trainer {
     ///
     /// # Panics
     /// If it is negative or not finite.
-    pub fn set_lr_scale(&mut self, pace: f64) {
-        assert!(pace >= 0.0 && pace.is_finite(), "the lr scale must be finite and at least 0, is {pace}");
-        self.pace = pace;
+    pub fn set_lr_scale(&mut self, lr_scale: f64) {
+        assert!(lr_scale >= 0.0 && lr_scale.is_finite(), "the lr scale must be finite and at least 0, is {lr_scale}");
+        self.lr_scale = lr_scale;
     }
 
     /// Finds the first infinite or NaN value that the next step would compute, with `fraction` as in

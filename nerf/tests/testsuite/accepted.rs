@@ -115,13 +115,13 @@ impl Outcome {
 /// Reads and analyses a capture.
 fn read(folder: &Path) -> Result<(Capture, SceneAnalysis)> {
     let capture = Capture::read(folder)?;
-    let survey = capture.analyze_scene(None)?;
-    Ok((capture, survey))
+    let analysis = capture.analyze_scene(None)?;
+    Ok((capture, analysis))
 }
 
 /// Trains one step on a capture and renders it.
-fn used((capture, survey): &(Capture, SceneAnalysis)) -> Result<Outcome> {
-    let data = capture.load(Split::Train, survey, &LoadOptions::default())?;
+fn used((capture, analysis): &(Capture, SceneAnalysis)) -> Result<Outcome> {
+    let data = capture.load(Split::Train, analysis, &LoadOptions::default())?;
     let mut config = tiny().with_scene_type(data.scene_type);
     let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
     (sampler.samples, sampler.occupancy.resolution) = (256, 16);

@@ -69,9 +69,9 @@ fn image_in_two_splits_is_an_error() {
     let mut capture = capture(folder.path(), 17);
     capture.hold_out();
     capture.check_splits().unwrap();
-    let survey = capture.analyze_scene(None).unwrap();
+    let analysis = capture.analyze_scene(None).unwrap();
     let names = |split: Split| {
-        let data = capture.load(split, &survey, &LoadOptions::default()).unwrap();
+        let data = capture.load(split, &analysis, &LoadOptions::default()).unwrap();
         data.frames.into_iter().map(|frame| frame.name).collect::<Vec<_>>()
     };
     let (train, test) = (names(Split::Train), names(Split::Test));
@@ -87,11 +87,11 @@ fn cameras_scale_with_their_images() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
     capture.hold_out();
-    let survey = capture.analyze_scene(None).unwrap();
+    let analysis = capture.analyze_scene(None).unwrap();
     let seen = Mutex::new(vec![]);
     let progress = |done: usize, total: usize| seen.lock().unwrap().push((done, total));
     let reading = LoadOptions { downscale: 5, views: 3, progress: &progress, ..LoadOptions::default() };
-    let data = capture.load(Split::Train, &survey, &reading).unwrap();
+    let data = capture.load(Split::Train, &analysis, &reading).unwrap();
     assert_eq!((data.frames.len(), &data.skipped[..]), (3, &["images/02.png".to_owned()][..]));
     let frame = &data.frames[0];
     let view = capture.views.iter().find(|view| view.name == frame.name).unwrap();
@@ -99,16 +99,16 @@ fn cameras_scale_with_their_images() {
     assert_eq!([frame.image.width, frame.image.height, frame.camera.width, frame.camera.height], [2, 2, 2, 2]);
     assert!((frame.camera.centre[0] - 13.0 / 12.0).abs() < 1e-12 && (frame.camera.centre[1] - 7.0 / 8.0).abs() < 1e-12);
     assert!((frame.camera.focal[0] - view.camera.focal[0] / 12.0).abs() < 1e-12);
-    let eye = survey.transform.point(view.camera.pose.translation);
-    assert!(frame.camera.pose.translation.distance(eye) < 1e-12 && data.transform == survey.transform);
+    let eye = analysis.transform.point(view.camera.pose.translation);
+    assert!(frame.camera.pose.translation.distance(eye) < 1e-12 && data.transform == analysis.transform);
     assert_eq!(seen.lock().unwrap().iter().max(), Some(&(3, 3)));
-    let full = capture.load(Split::Train, &survey, &LoadOptions::default()).unwrap();
+    let full = capture.load(Split::Train, &analysis, &LoadOptions::default()).unwrap();
     assert_eq!(full.frames[0].image.bytes(), 12 * 8 * 3);
     for (name, wrong) in [
         ("views", LoadOptions { views: 0, ..LoadOptions::default() }),
         ("downscale", LoadOptions { downscale: 0, ..LoadOptions::default() }),
     ] {
-        let message = capture.load(Split::Train, &survey, &wrong).unwrap_err().to_string();
+        let message = capture.load(Split::Train, &analysis, &wrong).unwrap_err().to_string();
         assert!(message.starts_with(&format!("`{name}`")), "{message}");
     }
 }
@@ -118,12 +118,12 @@ fn image_of_other_shape_than_camera_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
     capture.hold_out();
-    let survey = capture.analyze_scene(None).unwrap();
+    let analysis = capture.analyze_scene(None).unwrap();
     for name in ["03", "05"] {
         let image = Image::new(13, 8, 3);
         std::fs::write(folder.path().join(format!("images/{name}.png")), image.to_png()).unwrap();
     }
-    let message = capture.load(Split::Train, &survey, &LoadOptions::default()).unwrap_err().to_string();
+    let message = capture.load(Split::Train, &analysis, &LoadOptions::default()).unwrap_err().to_string();
     assert!(
         message.contains("frames[3]") && message.contains("03.png: has 13x8 pixels") && message.contains("24x16"),
         "{message}"
@@ -150,8 +150,8 @@ fn downscaled_image_folders_are_used() {
     std::fs::create_dir(folder.path().join("images_4")).unwrap();
     let small = Image { width: 3, height: 2, channels: 3, data: vec![1.0; 18] };
     std::fs::write(folder.path().join("images_4/01.png"), small.to_png()).unwrap();
-    let survey = capture.analyze_scene(None).unwrap();
-    let data = capture.load(Split::Train, &survey, &LoadOptions { downscale: 4, ..LoadOptions::default() }).unwrap();
+    let analysis = capture.analyze_scene(None).unwrap();
+    let data = capture.load(Split::Train, &analysis, &LoadOptions { downscale: 4, ..LoadOptions::default() }).unwrap();
     assert!(data.frames[0].name == "images/01.png" && data.frames[0].image.to_image() == small);
     assert_eq!([data.frames[1].image.width, data.frames[1].image.height], [3, 2]);
     let alone = Path::new("scene/images_4/a/01.png");
@@ -170,8 +170,8 @@ fn masks_drop_black_and_unlit_pixels() {
     mask.pixel_mut(9, 2)[0] = 0.0;
     std::fs::write(&path, mask.to_png()).unwrap();
     capture.views.iter_mut().for_each(|view| view.mask = Some(path.clone()));
-    let survey = capture.analyze_scene(None).unwrap();
-    let data = capture.load(Split::Train, &survey, &LoadOptions::default()).unwrap();
+    let analysis = capture.analyze_scene(None).unwrap();
+    let data = capture.load(Split::Train, &analysis, &LoadOptions::default()).unwrap();
     let used = data.frames[0].mask.as_ref().unwrap();
     assert!(used.used() == 12 * 8 - 1 && !used.uses(4, 1), "one pixel, at half the size");
     for (size, fits) in [([24, 16], true), ([16, 24], false), ([6, 4], false)] {
@@ -180,12 +180,12 @@ fn masks_drop_black_and_unlit_pixels() {
             Image { width: size[0], height: size[1], channels: 1, data: vec![1.0; size[0] * size[1]] }.to_png(),
         )
         .unwrap();
-        let read = capture.load(Split::Train, &survey, &LoadOptions::default());
+        let read = capture.load(Split::Train, &analysis, &LoadOptions::default());
         assert_eq!(read.is_ok(), fits, "{size:?}");
         assert!(read.err().is_none_or(|e| e.to_string().contains("mask.png: has")));
     }
     std::fs::write(&path, Image::new(24, 16, 1).to_png()).unwrap();
-    let message = capture.load(Split::Train, &survey, &LoadOptions::default()).unwrap_err().to_string();
+    let message = capture.load(Split::Train, &analysis, &LoadOptions::default()).unwrap_err().to_string();
     assert!(message.contains("has no usable pixel"), "{message}");
     // Half a turn is 31.4 pixels from the centre of a fisheye with the focal length 10.
     let lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
@@ -245,10 +245,10 @@ fn distances_are_read_if_requested() {
     image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(12, 8, image::Luma([500])).save(&path).unwrap();
     let measured = capture.views.iter_mut().find(|view| view.field == "frames[3]").unwrap();
     measured.depth = Some((path, 0.01));
-    let survey = capture.analyze_scene(None).unwrap();
+    let analysis = capture.analyze_scene(None).unwrap();
     let read = |distances| {
         let reading = LoadOptions { distances, ..LoadOptions::default() };
-        capture.load(Split::Train, &survey, &reading).unwrap()
+        capture.load(Split::Train, &analysis, &reading).unwrap()
     };
     assert!(read(false).frames.iter().all(|frame| frame.distances.is_none()));
     let data = read(true);
@@ -258,7 +258,7 @@ fn distances_are_read_if_requested() {
         assert_eq!((frame.name.as_str(), [found.width, found.height]), ("images/03.png", [12, 8]));
         // A depth of 5 in units of the capture.
         let place = frame.camera.ray(1.5, 2.5).at(f64::from(found.data[2 * 12 + 1]));
-        let depth = -frame.camera.pose.inverse().transform_point3(place).z / survey.transform.scale;
+        let depth = -frame.camera.pose.inverse().transform_point3(place).z / analysis.transform.scale;
         assert!((depth - 5.0).abs() < 1e-5, "{depth}");
     }
     assert_eq!(data.frames.iter().filter(|frame| frame.distances.is_some()).count(), 1);
@@ -274,10 +274,10 @@ fn unlit_pixels_are_dropped_with_or_without_mask() {
     for view in &mut capture.views {
         (view.camera.lens, view.camera.focal, view.camera.centre) = (lens, [2.0; 2], [12.0, 8.0]);
     }
-    let survey = capture.analyze_scene(Some(SceneType::Bounded)).unwrap();
+    let analysis = capture.analyze_scene(Some(SceneType::Bounded)).unwrap();
     let lit = |x: usize, y: usize| f64::hypot(x as f64 - 5.5, y as f64 - 3.5) <= std::f64::consts::PI;
     let check = |capture: &Capture, hidden: Option<[usize; 2]>| {
-        let data = capture.load(Split::Train, &survey, &LoadOptions::default()).unwrap();
+        let data = capture.load(Split::Train, &analysis, &LoadOptions::default()).unwrap();
         let mask = data.frames[0].mask.as_ref().unwrap();
         for (x, y) in (0..12).flat_map(|x| (0..8).map(move |y| (x, y))) {
             assert_eq!(mask.uses(x, y), lit(x, y) && hidden != Some([x, y]), "{x} {y} {hidden:?}");

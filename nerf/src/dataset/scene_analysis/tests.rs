@@ -31,17 +31,17 @@ fn quarter(radius: f64) -> Vec<Camera> {
 
 #[test]
 fn centre_and_up_come_from_cameras() {
-    let survey = SceneAnalysis::new(&capture(Format::Colmap, quarter(4.0)), None, None).unwrap();
-    assert_eq!(survey.scene_type, SceneType::Unbounded);
+    let analysis = SceneAnalysis::new(&capture(Format::Colmap, quarter(4.0)), None, None).unwrap();
+    assert_eq!(analysis.scene_type, SceneType::Unbounded);
     // Damping pulls the centre a little towards the cameras.
-    assert!(survey.transform.origin.distance(CENTRE) < 0.05, "{}", survey.transform.origin);
-    let up = survey.transform.rotation * DVec3::NEG_Y;
+    assert!(analysis.transform.origin.distance(CENTRE) < 0.05, "{}", analysis.transform.origin);
+    let up = analysis.transform.rotation * DVec3::NEG_Y;
     assert!(up.distance(DVec3::Z) < 1e-3, "{up}");
-    survey.transform.check().unwrap();
+    analysis.transform.check().unwrap();
     // Half of the box is half of the cameras' distance, which becomes 1.5 units.
-    assert!((survey.transform.scale - 1.5 / 2.0).abs() < 0.005, "{}", survey.transform.scale);
-    assert_eq!(survey.bounds, [DVec3::splat(-1.5), DVec3::splat(1.5)]);
-    assert!((survey.near - 0.05 * 3.0).abs() < 1e-3 && (survey.far - 3000.0).abs() < 1e-9, "{survey:?}");
+    assert!((analysis.transform.scale - 1.5 / 2.0).abs() < 0.005, "{}", analysis.transform.scale);
+    assert_eq!(analysis.bounds, [DVec3::splat(-1.5), DVec3::splat(1.5)]);
+    assert!((analysis.near - 0.05 * 3.0).abs() < 1e-3 && (analysis.far - 3000.0).abs() < 1e-9, "{analysis:?}");
     // An outlier, far away and looking elsewhere, has little influence.
     let mut cameras = quarter(4.0);
     cameras.push(camera(CENTRE + DVec3::new(300.0, 50.0, 0.0), CENTRE + DVec3::new(300.0, 90.0, 20.0), DVec3::NEG_Y));
@@ -56,14 +56,14 @@ fn outward_cameras_are_at_the_centre() {
         camera(eye, 3.0 * eye, DVec3::Z)
     });
     let mean = outwards.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / 4.0;
-    let survey = SceneAnalysis::new(&capture(Format::Transforms, outwards.to_vec()), None, None).unwrap();
-    assert!(survey.transform.origin.distance(mean) < 1e-9, "{}", survey.transform.origin);
-    assert!(survey.transform.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "upright already");
-    assert!(survey.reason.ends_with("; cameras look around"), "{}", survey.reason);
+    let analysis = SceneAnalysis::new(&capture(Format::Transforms, outwards.to_vec()), None, None).unwrap();
+    assert!(analysis.transform.origin.distance(mean) < 1e-9, "{}", analysis.transform.origin);
+    assert!(analysis.transform.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "upright already");
+    assert!(analysis.reason.ends_with("; cameras look around"), "{}", analysis.reason);
     // The scene is assumed to be three times as far as the cameras' spread, unless points give a distance.
     let spread = median(outwards.iter().map(|camera| camera.pose.translation.distance(mean)));
-    let half = |survey: &SceneAnalysis| 1.5 / survey.transform.scale;
-    assert!((half(&survey) - 3.0 * spread).abs() < 1e-9, "{}", half(&survey));
+    let half = |analysis: &SceneAnalysis| 1.5 / analysis.transform.scale;
+    assert!((half(&analysis) - 3.0 * spread).abs() < 1e-9, "{}", half(&analysis));
     let mut room = capture(Format::Colmap, outwards.to_vec());
     let wall = |i: usize| mean + 7.0 * DVec3::new((i as f64).cos(), (i as f64).sin(), 0.0);
     room.points = (0..150).map(|i| Point { position: wall(i), color: [0; 3], error: 1.0, views: 3 }).collect();
@@ -82,15 +82,15 @@ fn parallel_cameras_put_the_centre_ahead() {
     let mut wall = capture(Format::Colmap, wall.collect());
     let mean = wall.views.iter().map(|view| view.camera.pose.translation).sum::<DVec3>() / 5.0;
     let spread = median(wall.views.iter().map(|view| view.camera.pose.translation.distance(mean)));
-    let survey = SceneAnalysis::new(&wall, None, None).unwrap();
-    assert!(survey.transform.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9, "{}", survey.transform.origin);
+    let analysis = SceneAnalysis::new(&wall, None, None).unwrap();
+    assert!(analysis.transform.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9, "{}", analysis.transform.origin);
     assert_eq!(
-        survey.reason,
+        analysis.reason,
         "images are opaque, so they show a background, and all cameras look ahead; cameras look the same way"
     );
-    assert_eq!(survey.scene_type, SceneType::ForwardFacing);
-    let placed: Vec<Camera> = wall.views.iter().map(|view| survey.transform.camera(&view.camera)).collect();
-    assert_eq!(survey.ndc, Some(Ndc::around(&placed, survey.near).unwrap()));
+    assert_eq!(analysis.scene_type, SceneType::ForwardFacing);
+    let placed: Vec<Camera> = wall.views.iter().map(|view| analysis.transform.camera(&view.camera)).collect();
+    assert_eq!(analysis.ndc, Some(Ndc::around(&placed, analysis.near).unwrap()));
     let asked = SceneAnalysis::new(&wall, None, Some(SceneType::Unbounded)).unwrap();
     assert_eq!(
         asked,
@@ -98,15 +98,15 @@ fn parallel_cameras_put_the_centre_ahead() {
             scene_type: SceneType::Unbounded,
             ndc: None,
             reason: "as requested; cameras look the same way".into(),
-            ..survey
+            ..analysis
         }
     );
     assert_eq!(SceneAnalysis::new(&wall, Some("it is"), None).unwrap().scene_type, SceneType::Bounded);
     let place = |i: usize| DVec3::new(0.2 + 0.1 * (i as f64).sin(), 4.0, 0.0);
     wall.points = (0..150).map(|i| Point { position: place(i), color: [0; 3], error: 1.0, views: 3 }).collect();
-    let survey = SceneAnalysis::new(&wall, None, None).unwrap();
-    assert!(survey.transform.origin.distance(mean + 3.98 * DVec3::Y) < 0.01, "{}", survey.transform.origin);
-    assert!((1.5 / survey.transform.scale - 1.99).abs() < 0.03, "half of the distance");
+    let analysis = SceneAnalysis::new(&wall, None, None).unwrap();
+    assert!(analysis.transform.origin.distance(mean + 3.98 * DVec3::Y) < 0.01, "{}", analysis.transform.origin);
+    assert!((1.5 / analysis.transform.scale - 1.99).abs() < 0.03, "half of the distance");
     // Depth alone counts, not lateral distance: a flight at a height of 50 over a wide field.
     let flight = (0..25).map(|i| {
         let eye = DVec3::new(100.0 * f64::from(i % 5), 100.0 * f64::from(i / 5), 50.0);
@@ -120,10 +120,10 @@ fn parallel_cameras_put_the_centre_ahead() {
     // Many unreliable points.
     let bad = Point { position: DVec3::new(0.0, 0.0, -900.0), color: [0; 3], error: 9.0, views: 1 };
     flight.points.extend(std::iter::repeat_n(bad, 600));
-    let survey = SceneAnalysis::new(&flight, None, None).unwrap();
-    assert!(survey.reason.ends_with("; cameras look the same way"), "{}", survey.reason);
-    assert!(survey.transform.origin.distance(DVec3::new(200.0, 200.0, 0.0)) < 8.0, "{}", survey.transform.origin);
-    assert!(1.5 / survey.transform.scale > 100.0, "all of the flight is in the box");
+    let analysis = SceneAnalysis::new(&flight, None, None).unwrap();
+    assert!(analysis.reason.ends_with("; cameras look the same way"), "{}", analysis.reason);
+    assert!(analysis.transform.origin.distance(DVec3::new(200.0, 200.0, 0.0)) < 8.0, "{}", analysis.transform.origin);
+    assert!(1.5 / analysis.transform.scale > 100.0, "all of the flight is in the box");
     // Ninety-nine points are too few.
     wall.points.truncate(99);
     let few = SceneAnalysis::new(&wall, None, None).unwrap();
@@ -136,14 +136,14 @@ fn forward_walk_is_not_forward_facing() {
         let eye = DVec3::new(0.1 * f64::from(i % 2), 0.3 * f64::from(i), 0.0);
         camera(eye, eye + DVec3::Y, DVec3::Z)
     });
-    let survey = SceneAnalysis::new(&capture(Format::Colmap, walk.collect()), None, None).unwrap();
-    assert_eq!((survey.scene_type, survey.ndc), (SceneType::Unbounded, None));
+    let analysis = SceneAnalysis::new(&capture(Format::Colmap, walk.collect()), None, None).unwrap();
+    assert_eq!((analysis.scene_type, analysis.ndc), (SceneType::Unbounded, None));
     let asked = SceneAnalysis::new(&capture(Format::Colmap, quarter(4.0)), None, Some(SceneType::ForwardFacing))
         .unwrap_err()
         .to_string();
     let expected = "cannot be forward-facing: cameras look in different directions; use unbounded";
     assert_eq!(asked, format!("`scene-type`: {expected}"));
-    assert!(survey.reason.starts_with("images are opaque, so they show a background; "), "{}", survey.reason);
+    assert!(analysis.reason.starts_with("images are opaque, so they show a background; "), "{}", analysis.reason);
 }
 
 #[test]
@@ -154,21 +154,21 @@ fn downward_cameras_have_up_behind_them() {
         let eye = DVec3::new(f64::from(i), f64::from(i % 3), 50.0);
         camera(eye, eye - DVec3::Z * 50.0, north)
     });
-    let survey = SceneAnalysis::new(&capture(Format::Colmap, flight.collect()), None, None).unwrap();
-    assert!((survey.transform.rotation * DVec3::Z).z > 0.9, "{:?}", survey.transform.rotation);
+    let analysis = SceneAnalysis::new(&capture(Format::Colmap, flight.collect()), None, None).unwrap();
+    assert!((analysis.transform.rotation * DVec3::Z).z > 0.9, "{:?}", analysis.transform.rotation);
 }
 
 #[test]
 fn bounded_scene_is_as_wide_as_cameras_see() {
     let eyes = [DVec3::new(3.0, 0.0, 0.0), DVec3::new(0.0, 4.0, 0.0), DVec3::new(-8.0, 0.0, 0.0)];
     let cameras = eyes.map(|eye| camera(eye, DVec3::ZERO, DVec3::Z));
-    let survey =
+    let analysis =
         SceneAnalysis::new(&capture(Format::Transforms, cameras.to_vec()), Some("it is transparent"), None).unwrap();
-    assert_eq!(survey.scene_type, SceneType::Bounded);
+    assert_eq!(analysis.scene_type, SceneType::Bounded);
     // Half of 300 rows over a focal length of 250 is more than half of 400 columns over 500: 0.6 of the distance 4.
-    let half = 1.5 / survey.transform.scale;
+    let half = 1.5 / analysis.transform.scale;
     assert!((half - 2.4).abs() < 0.02, "{half}");
-    let (near, far) = (survey.near / survey.transform.scale, survey.far / survey.transform.scale);
+    let (near, far) = (analysis.near / analysis.transform.scale, analysis.far / analysis.transform.scale);
     assert!((near - 0.2).abs() < 0.02 && (far - (8.0 + 3.0_f64.sqrt() * 2.4)).abs() < 0.1, "{near} {far}");
 }
 
@@ -182,8 +182,8 @@ fn near_plane_comes_from_points_or_depths() {
     capture.points =
         (0..400).map(|i| point([0.1, 0.2, 1.0].get(i).copied().unwrap_or(1.0 + 0.01 * i as f64))).collect();
     let near = |capture: &Capture| {
-        let survey = SceneAnalysis::new(capture, None, None).unwrap();
-        survey.near / survey.transform.scale
+        let analysis = SceneAnalysis::new(capture, None, None).unwrap();
+        analysis.near / analysis.transform.scale
     };
     assert!((near(&capture) - 0.5).abs() < 0.2, "{}", near(&capture));
     let usual = 0.05 * 4.0;
@@ -202,9 +202,9 @@ fn near_plane_comes_from_points_or_depths() {
     });
     let mut forward = self::capture(Format::Llff, forward.collect());
     forward.views.iter_mut().for_each(|view| view.bounds = Some([2.0, 6.0]));
-    let survey = SceneAnalysis::new(&forward, None, None).unwrap();
-    assert!(survey.transform.origin.distance(DVec3::new(0.2, 3.0, 0.0)) < 1e-9, "{}", survey.transform.origin);
-    assert!((survey.near / survey.transform.scale - 1.0).abs() < 1e-9);
+    let analysis = SceneAnalysis::new(&forward, None, None).unwrap();
+    assert!(analysis.transform.origin.distance(DVec3::new(0.2, 3.0, 0.0)) < 1e-9, "{}", analysis.transform.origin);
+    assert!((analysis.near / analysis.transform.scale - 1.0).abs() < 1e-9);
 }
 
 #[test]

@@ -169,7 +169,7 @@ fn glb_files_are_read_by_another_library() {
 #[test]
 fn shapes_are_written_in_capture_coordinates() {
     // A quarter turn about z maps x of the capture to y of the scene. Half a scene unit is a unit of the capture.
-    let placement = SceneTransform {
+    let transform = SceneTransform {
         rotation: DMat3::from_quat(DQuat::from_rotation_z(FRAC_PI_2)),
         scale: 0.5,
         origin: DVec3::new(10.0, 20.0, 30.0),
@@ -177,10 +177,10 @@ fn shapes_are_written_in_capture_coordinates() {
     let mut shape = points();
     shape.mesh.positions[0] = DVec3::new(1.0, 2.0, 3.0);
     shape.normals[0] = DVec3::Y;
-    let (place, back) = (shape.mesh.positions[1], shape.into_capture(&placement));
+    let (place, back) = (shape.mesh.positions[1], shape.into_capture(&transform));
     assert!(back.mesh.positions[0].abs_diff_eq(DVec3::new(10.0 + 4.0, 20.0 - 2.0, 30.0 + 6.0), 1e-12));
     assert!(back.normals[0].abs_diff_eq(DVec3::X, 1e-12), "a direction has no length to scale: {}", back.normals[0]);
-    assert!(placement.point(back.mesh.positions[1]).abs_diff_eq(place, 1e-9));
+    assert!(transform.point(back.mesh.positions[1]).abs_diff_eq(place, 1e-9));
 }
 
 #[test]
