@@ -10,8 +10,8 @@ use raygrad_nerf::dataset::Split;
 
 /// Horizontal field of view in radians.
 const ANGLE_X: f64 = PI / 3.0;
-/// One lap around the bulldozer each, in scene units: the camera's height above the ground, its distance from the
-/// vertical axis, and the height of the point of that axis it looks at.
+/// The laps around the bulldozer, in scene units. Each has the camera's height above the ground, its distance from the
+/// vertical axis, and the height of the point on that axis at which it looks.
 const LAPS: [[f64; 3]; 3] = [[0.65, 3.75, 0.7], [1.45, 4.1, 0.85], [2.4, 4.2, 1.0]];
 /// Number of training images.
 const TRAIN: usize = 100;

@@ -83,8 +83,8 @@ struct Layer {
 
 /// Extracts the surface around all points where `density` exceeds `level`, facing outwards.
 ///
-/// It is marching cubes (Lorensen and Cline 1987) with a consistent table: the surface has no holes and each side of a
-/// triangle has two triangles, except at the lattice's border. Vertices on lattice edges are found by bisection.
+/// It is marching cubes (Lorensen and Cline 1987) with a consistent table. The surface has no holes, and two triangles
+/// meet at each edge, except at the lattice's border. Vertices on lattice edges are found by bisection.
 /// Positions are f32. Memory is proportional to a layer of the lattice and to the surface. `progress` receives the
 /// share of the lattice, 0 to 1.
 ///

@@ -68,7 +68,7 @@ impl<'a> Probe<'a> {
     /// For each place the unit normal, and the colour that is seen when one looks along it from outside, in sRGB.
     ///
     /// The normal is against the slope of `ln(1 + reach density)` from `reach` before a place to `reach` behind it,
-    /// along each axis: the field's own gradient is that of noise finer than a pixel. Where there is no slope the
+    /// along each axis. The field's own gradient would show noise finer than a pixel. Where there is no slope, the
     /// normal is up.
     pub fn look(&self, grid: Option<&OccupancyGrid>, reach: f64, places: &[DVec3]) -> (Vec<DVec3>, Vec<[u8; 3]>) {
         let gains = self.model.gain();

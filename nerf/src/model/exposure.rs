@@ -43,8 +43,8 @@ impl ExposureConfig {
 /// - `exposure` `[images, 3]`: e for red, green and blue, which includes white balance (per-image exposure of Mueller
 ///   et al. 2022, instant-ngp). Between 0.2 and 1, a gain of light is nearly a gain of stored values.
 /// - `vignetting` `[3]`: v1, v2 and v3, shared by all images. s is the square of a pixel's [distance from the optical
-///   axis](crate::camera::Camera::off_axis) in units of half the diagonal (Goldman and Chen 2005, "Vignette and
-///   exposure calibration and compensation", equation 2, as a logarithm, so that no gain is negative).
+///   axis](crate::camera::Camera::off_axis) in units of half the diagonal. This is equation 2 of Goldman and Chen 2005,
+///   "Vignette and exposure calibration and compensation", as a logarithm, so that no gain is negative.
 ///
 /// The background is not multiplied. Renders use the geometric mean of all exposures, or the exposure of
 /// [`appearance_image`](crate::Model::appearance_image), and no vignetting unless

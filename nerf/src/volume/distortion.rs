@@ -7,9 +7,9 @@ use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeErr
 /// The operation `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i` for each ray: weights `w` `[samples]` to `[rays]`,
 /// with midpoints `m` and interval lengths `d` (Barron et al. 2022, mip-NeRF 360, equation 15).
 ///
-/// The double sum is `w . D w` with `(D w)_i = sum_j w_j |m_i - m_j|`, of which two passes give the part from the left,
-/// `L_(i+1) = L_i + W_i (m_(i+1) - m_i)` with W the sum of the weights so far, and the part from the right. Nothing is
-/// subtracted but neighbouring midpoints, so samples close together keep their digits. dw = g (2 D w + 2/3 d w).
+/// The double sum is `w . D w` with `(D w)_i = sum_j w_j |m_i - m_j|`. Two passes give its parts from the left and from
+/// the right. From the left it is `L_(i+1) = L_i + W_i (m_(i+1) - m_i)`, with W the sum of the weights so far. Only
+/// neighbouring midpoints are subtracted, so samples close together keep their digits. dw = g (2 D w + 2/3 d w).
 ///
 /// Midpoints and lengths are constants, usually as shares of the ray's span.
 #[derive(Debug, Clone)]

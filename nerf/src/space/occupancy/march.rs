@@ -54,7 +54,7 @@ impl OccupancyGrid {
     /// most `step.max_samples`.
     ///
     /// Sample `i` lies at the same distance whatever is occupied. Its interval is that between `i` and `i + 1` whole
-    /// steps from the entry, so the last may reach beyond the box, and with random jitter the integral is unbiased.
+    /// steps from the entry, so the last may reach beyond the box. With random jitter the integral is unbiased.
     /// Samples that rounding puts outside of the box are dropped. A ray with a non-finite number has no samples.
     ///
     /// # Panics

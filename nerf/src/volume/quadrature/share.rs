@@ -14,9 +14,9 @@ const LEAD_SERIES: [f64; 6] =
 /// `a` and `b` are the densities of the two nodes and `x` the optical depth of the interval, each `[intervals]`. Where
 /// the share is clamped, and where both densities are 0, it is a constant.
 ///
-/// With the nodes at optical depths `tau_a = h (a/4 + b (1/4 - s/6))` and `tau_b = h (a (1/4 + s/6) + b/4)`, s the root
-/// of 3, colour linear in optical depth gives `f = (m - tau_a) / (tau_b - tau_a)` with the mean optical depth `m = 1 -
-/// x / (e^x - 1)` from which light comes. That is `b / (a + b) - s (1/2 - 1/x + 1/(e^x - 1))`. Beyond a depth of about
+/// The nodes are at optical depths `tau_a = h (a/4 + b (1/4 - s/6))` and `tau_b = h (a (1/4 + s/6) + b/4)`, with s the
+/// root of 3. Light comes from the mean optical depth `m = 1 - x / (e^x - 1)`. Colour linear in optical depth gives
+/// `f = (m - tau_a) / (tau_b - tau_a)`. That is `b / (a + b) - s (1/2 - 1/x + 1/(e^x - 1))`. Beyond a depth of about
 /// 5 that would extrapolate: it is clamped at 0.
 pub fn gauss_share<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>, x: &Var<'t, T>) -> Var<'t, T> {
     let sum = a + b;
