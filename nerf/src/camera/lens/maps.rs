@@ -1,7 +1,7 @@
 //! The formulas of lenses, generic over the number type, so that the same code gives values and derivatives.
 //!
-//! A distortion maps places of the image plane to places. [`rational`] begins at `(x / z, y / z)`. [`thin_prism`] begins
-//! at the direction's angle to the axis, as a length towards `(x, y)`.
+//! A distortion maps places of the image plane to places. [`rational`] begins at `(x / z, y / z)`. [`thin_prism`]
+//! begins at the direction's angle to the axis, as a length towards `(x, y)`.
 
 use crate::camera::angles::{angle_over, sinc_and_cos_of_root};
 use raygrad_autograd::Real;

@@ -3,7 +3,9 @@
 //! Samples come in blocks. For a block and a level, rows and weights of all corners are computed first, side by side in
 //! vector registers. Then the rows are visited one sample after the other. While a level is read, the rows of the next
 //! one are prefetched. The table is larger than the caches near a core, and without prefetching, reading takes twice as
-//! long. Adding visits one level of many samples at a time; there the rows of the next block are prefetched. Products are not
+//! long.
+//!
+//! Adding visits one level of many samples at a time; there the rows of the next block are prefetched. Products are not
 //! fused, so the bits are the same on every instruction set.
 
 use super::grid::{HashLevel, PRIMES};

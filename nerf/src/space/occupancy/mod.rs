@@ -14,8 +14,8 @@
 //! [`OccupancyGrid::rebuild`] samples eight points around all occupied cells and adds a margin, which suits rendering.
 //!
 //! # Layout
-//! A block of 4 x 4 x 4 cells is one 64-bit word. Each block also has the largest empty cube in each of the eight octants
-//! of directions, so that a ray crosses empty space in a few steps.
+//! A block of 4 x 4 x 4 cells is one 64-bit word. Each block also has the largest empty cube in each of the eight
+//! octants of directions, so that a ray crosses empty space in a few steps.
 //!
 //! ```
 //! use glam::DVec3;
