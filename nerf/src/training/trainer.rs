@@ -80,8 +80,8 @@ impl Trainer {
     /// Creates a model and its trainer for a dataset.
     ///
     /// # Errors
-    /// If the configuration is out of range or does not fit the [type of scene](Dataset::scope). If the dataset has no
-    /// frame, or none of its rays [meets the scene box](Dataset::check_reach).
+    /// If the configuration is out of range or does not fit the [type of scene](Dataset::scene_type). If the dataset
+    /// has no frame, or none of its rays [meets the scene box](Dataset::check_reach).
     pub fn new(config: Config, data: Arc<Dataset>) -> Result<Self> {
         if data.scene_type.is_unbounded() && !config.unbounded {
             let what = "is false, but the dataset is unbounded; use `Config::with_scene_type` with the dataset's type";
@@ -106,8 +106,8 @@ impl Trainer {
         Trainer::with_clock(config, data, extent, move || start.elapsed())
     }
 
-    /// Creates a trainer as [`with_extent`](Self::with_extent), with a clock for training time: it returns the time
-    /// since a fixed moment.
+    /// Creates a trainer as [`with_scene_box`](Self::with_scene_box), with a clock for training time, which returns the
+    /// time since a fixed moment.
     ///
     /// # Errors
     /// As [`new`](Self::new).

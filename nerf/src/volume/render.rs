@@ -124,7 +124,7 @@ impl<'t, T: Scalar> Rendered<'t, T> {
     /// constant. It is recorded, so that losses of normals are differentiable.
     ///
     /// # Panics
-    /// If positions are not on the tape: see [`Query::slopes`](super::Query::slopes).
+    /// If positions are not on the tape: see [`Query::position_grad`](super::Query::position_grad).
     #[track_caller]
     pub fn normals(&self) -> Var<'t, T> {
         // The log density falls in the same direction and does not overflow.
