@@ -132,7 +132,7 @@ fn lenses_and_poses_survive_every_format() {
     let expected = "raygrad: warning: scene: 2 held-out images lose their split, which the format cannot store: \
                     readers hold out others, such as every eighth\n";
     assert_eq!(String::from_utf8(output.stderr).unwrap(), expected);
-    // A dataset that is another's is trained on as it is.
+    // A foreign dataset is trained on without conversion.
     place.succeeds(&format!("train back --scene-type bounded --steps 1 {CLASSIC}"));
 }
 

@@ -396,10 +396,10 @@ fn doctor_exit_code_is_that_of_the_worst_finding() {
     let report = |code: i32| report_of("", code);
     assert_eq!(report(0)["findings"], json!([]));
     let layout = |flags: &str| report_of(flags, 0)["facts"]["layout"].clone();
-    assert_eq!(layout("")["scope"], "bounded");
+    assert_eq!(layout("")["scene_type"], "bounded");
     let asked = layout("--scene-type unbounded");
     assert_eq!(
-        json!([asked["scope"], asked["reason"]]),
+        json!([asked["scene_type"], asked["reason"]]),
         json!(["unbounded", "as requested; cameras look at one place"])
     );
     std::fs::remove_file(place.path("capture/images/05.png")).unwrap();
@@ -557,7 +557,10 @@ fn absent_images_are_skipped_with_a_warning() {
     let output = place.command(&format!("train scene --steps 1 {CLASSIC}")).output().unwrap();
     let (printed, warned) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success() && printed.contains("5 images of 24x24"), "{printed}{warned}");
-    assert!(warned.contains("raygrad: warning: scene: the train image `train/r_3` is missing"), "{warned}");
+    assert!(
+        warned.contains("raygrad: warning: scene: 1 of 6 images is missing and was skipped: `train/r_3`\n"),
+        "{warned}"
+    );
 }
 
 /// Runs of version 0.1 stored the whole grid; they must load in all later versions.
@@ -686,11 +689,11 @@ fn carving_votes_are_configurable() {
 #[test]
 fn embeddings_and_poses_are_trained_and_stored() {
     let place = Place::with_scene();
-    let learned = r#"--set field.appearance_embedding_dim=4 --set poses={"constant":{"rate":0.001}}"#;
+    let learned = r#"--set field.appearance_embedding_dim=4 --set poses={"constant":{"lr":0.001}}"#;
     place.succeeds(&format!("train scene --steps 20 --out run {SMALL} {learned}"));
     let config = place.json("run/config.json");
     let fields = [&config["config"]["field"]["appearance_embedding_dim"], &config["scene_box"]["frames"]];
-    assert_eq!(json!([fields, config["config"]["poses"]]), json!([[4, 6], { "constant": { "rate": 0.001 } }]));
+    assert_eq!(json!([fields, config["config"]["poses"]]), json!([[4, 6], { "constant": { "lr": 0.001 } }]));
     let mut model = captures::model(&place, "run");
     for (i, frame) in load(place.path("scene"), Split::Train, 1).unwrap().frames.iter().enumerate() {
         let [given, learned] = [frame.camera.pose, model.learned_camera(i, &frame.camera).pose];
@@ -734,15 +737,15 @@ fn bad_arguments_are_usage_errors() {
         ("train --budget 10m --steps 5", "cannot be used with"),
         ("train --budget 10", "90s, 10m or 1.5h"),
         ("train --budget 0s", "more than 0"),
-        ("train --steps 0", "0 is not in 1.."),
-        ("train --downscale 0", "0 is not in 1.."),
-        ("train --threads 0", "0 is not in 1.."),
+        ("train --steps 0", "write a whole number of at least 1"),
+        ("train --downscale 0", "write a whole number from 1 to 16384"),
+        ("train --threads 0", "write a whole number from 1 to 1024"),
         ("train --preset huge", "use classic, small, instant or voxel"),
         ("train --background grey", "white, black or random"),
         ("train --refine all", "use poses, focal, lens, exposure or vignetting"),
         ("eval", "required arguments"),
         ("eval run --split all", "use train, val or test"),
-        ("eval run --views 0", "0 is not in 1.."),
+        ("eval run --views 0", "write a whole number of at least 1"),
         ("render run --size 0x0", "WIDTHxHEIGHT"),
         ("render run --path fly", "use orbit, spiral, spline, test or a FILE.json"),
     ];

@@ -292,7 +292,7 @@ fn bad_inputs_are_named() {
     for (arguments, expected) in [
         ("prepare photos", "--out"),
         ("prepare photos --out made --to tiff", "possible values: nerfstudio, colmap, colmap-text, llff, blender"),
-        ("prepare photos --out made --frames 0", "0 is not in 1.."),
+        ("prepare photos --out made --frames 0", "write a whole number from 1 to 10000"),
         ("prepare photos --out made --to colmap --frames 3", "cannot be used with"),
     ] {
         let output = run(&place, arguments);
