@@ -185,7 +185,7 @@ mod tests {
                      --set sampler.view_step=0.05 --out";
         let args = super::train::Args::parse_from(small.split_whitespace().chain(run.to_str()));
         assert!(super::first_run(&args).is_ok_and(|code| code == ExitCode::SUCCESS));
-        let image = raygrad::nerf::Image::open(run.join("picture.png")).unwrap();
+        let image = raygrad::nerf::Image::open(run.join("render.png")).unwrap();
         assert_eq!([image.width, image.height], [10, 10]);
     }
 
