@@ -63,7 +63,7 @@ impl<T: Scalar> Tape<T> {
     /// unrecorded pass can find the rows that matter, and a recorded pass can reuse their outputs.
     ///
     /// ```
-    /// use raygrad_autograd::{Grads, Memo, Op, ShapeError, Tape, Vjp};
+    /// use raygrad_autograd::{Grads, CachedOutputs, Op, ShapeError, Tape, Vjp};
     /// use raygrad_tensor::{Pool, Scalar, Shape, Tensor, map};
     ///
     /// /// y = x^2, at a price.
@@ -81,7 +81,7 @@ impl<T: Scalar> Tape<T> {
     /// let (y, memo) = tape.no_grad(|| tape.cache_outputs(|| tape.apply(Square, &[&x])));
     /// let large: Vec<u32> = (0..3).filter(|&i| y.value().as_slice()[i as usize] > 2.0).collect();
     /// let rows: Vec<[u32; 2]> = large.iter().map(|&row| [0, row]).collect();
-    /// let memo = Memo::gather(&[memo], &rows, tape.pool());
+    /// let memo = CachedOutputs::gather(&[memo], &rows, tape.pool());
     /// let again = tape.reuse_outputs(memo, || tape.apply(Square, &[&x.gather_rows(large)]));
     /// assert_eq!(again.value(), [4.0, 9.0]);
     /// assert_eq!(again.sum().grad(&[&x])[0], [0.0, 4.0, 6.0]);

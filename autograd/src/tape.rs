@@ -34,7 +34,7 @@ pub struct Tape<T: Scalar> {
     differentiating: Cell<Option<&'static Location<'static>>>,
     /// While a method that consists of several operations runs: the line of the user's code that called it.
     within: Cell<Option<&'static Location<'static>>>,
-    /// Outputs being saved, and outputs being reused ([`crate::Memo`]).
+    /// Outputs being saved, and outputs being reused ([`crate::CachedOutputs`]).
     pub(crate) cached: Cell<Option<Vec<Tensor<T>>>>,
     pub(crate) reused: Cell<Option<std::vec::IntoIter<Tensor<T>>>>,
 }

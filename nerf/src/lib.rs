@@ -11,7 +11,7 @@
 //!
 //! // Images and cameras of a folder, at half of their size.
 //! let train = Arc::new(load("lego", Split::Train, 2)?);
-//! let config = Config::preset(Preset::Instant).with_scene_type(train.scope);
+//! let config = Config::preset(Preset::Instant).with_scene_type(train.scene_type);
 //!
 //! // Train for a minute, and print the PSNR of the training rays.
 //! let mut trainer = Trainer::new(config, train)?;
