@@ -29,7 +29,7 @@ use std::sync::Arc;
 /// assert_eq!(vectors.shape(), [3, 8]);
 /// let grads = bound.backward(&vectors.square().sum());
 /// let report = adam.update(&mut params, &grads, 1e-3);
-/// assert_eq!(report.moved, 2 * 8);
+/// assert_eq!(report.updated, 2 * 8);
 /// ```
 #[derive(Debug, Clone, Copy)]
 pub struct Embedding {
