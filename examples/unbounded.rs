@@ -68,11 +68,11 @@ fn main() -> Result<()> {
             continue;
         }
         let data = Dataset { scene_type, ..train.clone() };
-        let mut config = usual.clone().for_budget(budget.samples(), data.pixels_per_side()).with_scene_type(scene_type);
+        let mut config = usual.clone().for_budget(budget.samples(), data.pixels_per_side());
         if name == "contraction" {
-            let proposal = ProposalConfig::default();
-            config.sampler = SamplerConfig::new(proposal);
+            config.sampler = SamplerConfig::new(ProposalConfig::default());
         }
+        let config = config.with_scene_type(scene_type);
         let mut trainer = Trainer::new(config, Arc::new(data))?;
         trainer.run(budget, |_| ControlFlow::Continue(()));
         let start = Instant::now();

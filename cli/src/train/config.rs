@@ -28,6 +28,11 @@ impl Args {
         if let Some(skip) = self.skip {
             config = config.with_skip(skip);
         }
+        // Before the scene type, which weighs the distortion loss by the sampler.
+        let is_proposal = |(name, value): &&(String, Value)| name == "sampler" && value["kind"] == "proposal";
+        if let Some((name, value)) = self.set.iter().find(is_proposal) {
+            config = changed(&config, name, value)?;
+        }
         config = config.with_scene_type(data.scene_type);
         if let Some(carve) = self.carve {
             let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
@@ -150,6 +155,19 @@ fn default_budget(preset: Preset) -> Duration {
 mod tests {
     use super::*;
     use clap::Parser;
+    use raygrad::nerf::losses::DistortionConfig;
+
+    #[test]
+    fn proposals_of_a_flag_get_their_distortion_weight() {
+        let data = raygrad_scenes::landscape(raygrad::nerf::dataset::Split::Test, 8);
+        let weight = |flags: &str| {
+            let config = Args::parse_from(format!("train {flags}").split_whitespace()).config(&data).unwrap();
+            config.loss_terms[0].get::<DistortionConfig>().unwrap().weight
+        };
+        assert_eq!(weight(""), 0.1);
+        assert_eq!(weight(r#"--set sampler={"kind":"proposal"}"#), 0.002);
+        assert_eq!(weight(r#"--loss distortion=0.5 --set sampler={"kind":"proposal"}"#), 0.5);
+    }
 
     #[test]
     fn budget_is_of_the_flag_or_the_preset() {

@@ -12,6 +12,7 @@ use crate::range::{check_range, check_schedule};
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
+use crate::sampling::proposal::ProposalConfig;
 use crate::space::occupancy::Skip;
 use crate::volume::quadrature::Quadrature;
 use crate::{Error, Result};
@@ -33,6 +34,8 @@ const SAMPLES: usize = 4;
 const CONE: f64 = 1.0 / 64.0;
 /// Weight of the distortion loss in unbounded scenes, where few images show each point.
 const DISTORTION: f64 = 0.1;
+/// The same with proposals, as in nerfacto. With the weight above they collapse onto floaters.
+const PROPOSAL_DISTORTION: f64 = 0.002;
 
 /// Learning rates of cameras at the start and the end of a run. Units: radians of image motion, logarithms of focal
 /// lengths, lens coefficients.
@@ -285,7 +288,9 @@ impl Config {
         }
         let field = self.field.get_mut::<InstantConfig>();
         if self.unbounded {
-            self.loss_terms.push(LossTermConfig::new(DistortionConfig { weight: DISTORTION }));
+            let has_proposals = self.sampler.get::<ProposalConfig>().is_some();
+            let weight = if has_proposals { PROPOSAL_DISTORTION } else { DISTORTION };
+            self.loss_terms.push(LossTermConfig::new(DistortionConfig { weight }));
             field.into_iter().for_each(|field| field.grid.finest *= 2);
         } else {
             self.loss_terms.retain(|term| term.get::<DistortionConfig>().is_none());
@@ -494,6 +499,13 @@ mod tests {
         for other in [Preset::Voxel, Preset::Small, Preset::Classic] {
             Config::preset(other).with_scene_type(SceneType::Unbounded).check().unwrap();
         }
+        // The weight of the distortion loss suits the sampler.
+        let weight = |config: Config| config.loss_terms[0].get::<DistortionConfig>().unwrap().weight;
+        let proposals = Config { sampler: SamplerConfig::new(ProposalConfig::default()), ..preset.clone() };
+        assert_eq!(
+            [&preset, &proposals].map(|c| weight(c.clone().with_scene_type(SceneType::Unbounded))),
+            [0.1, 0.002]
+        );
         // The same number of rays as before, each with more samples.
         let skipped = Config::preset(Preset::Small).with_skip(Skip::Fast);
         let samples = |config: &Config| config.sampler.get::<MarchingConfig>().unwrap().samples;
