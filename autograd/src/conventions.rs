@@ -69,6 +69,10 @@
 //! | `asin(x)` | `2` | `NaN` | `NaN` | |
 //! | `atan2(a, b)` | `0; 0` | `0` | `0; 0` | no direction, no gradient |
 //! | `atan2(a, b)` | `0; -1` | `3.141592653589793` | `-1; 0` | the cut is reached from above |
+//! | `hypot(a, b)` | `0; 0` | `0` | `0; 0` | no direction, no gradient |
+//! | `logaddexp(a, b)` | `-inf; -inf` | `-inf` | `0.5; 0.5` | as of equal numbers |
+//! | `remainder(a, b)` | `-1; 3` | `2` | `1; 1` | the sign of b, as in Python |
+//! | `remainder(a, b)` | `6; 3` | `0` | `1; -2` | the slope of the branch above the step |
 //! | `powi(x, 0)` | `0` | `1` | `0` | 0^0 = 1 |
 //! | `powi(x, -1)` | `0` | `inf` | `-inf` | |
 //! | `powf(x, 0.5)` | `0` | `0` | `inf` | |
@@ -155,6 +159,9 @@ mod tests {
             "asin(x)" => a.asin(),
             "acos(x)" => a.acos(),
             "atan2(a, b)" => a.atan2(b),
+            "hypot(a, b)" => a.hypot(b),
+            "logaddexp(a, b)" => a.logaddexp(b),
+            "remainder(a, b)" => a.remainder(b),
             "powi(x, 0)" => a.powi(0),
             "powi(x, -1)" => a.powi(-1),
             "powf(x, 0.5)" => a.powf(0.5),

@@ -1,10 +1,9 @@
 //! Dual numbers: forward-mode derivatives, which give the gradients of a formula.
 
 use crate::ops::piecewise::share;
-use crate::ops::power::{slope_of_base, slope_of_exponent};
-use crate::ops::trigonometric::{complement, turn};
-use raygrad_tensor::Real;
-use std::f64::consts::{FRAC_2_SQRT_PI, LN_2, PI};
+use crate::slopes::*;
+use raygrad_tensor::{Plain, Real};
+use std::f64::consts::{FRAC_1_SQRT_2, FRAC_2_SQRT_PI, LOG2_E, PI};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
 /// A number and its derivatives in `N` directions: `value + sum of slopes[i] e_i`, with `e_i e_j = 0`.
@@ -46,26 +45,6 @@ impl<E: Real, const N: usize> Dual<E, N> {
             k += 1;
         }
         Dual { value: y, slopes }
-    }
-
-    /// A function with value `y` and derivative `dy`.
-    #[inline(always)]
-    fn chain(self, y: E, dy: E) -> Self {
-        self.map(
-            y,
-            #[inline(always)]
-            |s| s * dy,
-        )
-    }
-
-    /// A function with value `y` and derivative `1 / x`.
-    #[inline(always)]
-    fn over(self, y: E, x: E) -> Self {
-        self.map(
-            y,
-            #[inline(always)]
-            |s| s / x,
-        )
     }
 
     /// A function of two numbers with value `y`, from the slope in either argument alone, and in both.
@@ -164,7 +143,7 @@ impl<E: Real, const N: usize> Div for Dual<E, N> {
             #[inline(always)]
             |s| s / b.value,
             #[inline(always)]
-            |t| -(t * y / b.value),
+            |t| -over_square(t, self.value, b.value),
             #[inline(always)]
             |s, t| (s - t * y) / b.value,
         )
@@ -183,27 +162,18 @@ impl<E: Real, const N: usize> Neg for Dual<E, N> {
     }
 }
 
-/// Functions of one number, by value and derivative at `x`.
-macro_rules! chain {
-    ($($f:ident: |$x:ident| $y:expr, $dy:expr;)*) => {
+/// Functions of one number, by the slope of the result for a slope `s` of the argument `x`.
+macro_rules! slopes {
+    ($($f:ident: |$s:ident, $x:ident| $slope:expr;)*) => {
         $(
             #[inline(always)]
             fn $f(self) -> Self {
                 let $x = self.value;
-                self.chain($y, $dy)
-            }
-        )*
-    };
-}
-
-/// Functions of one number, by value and the reciprocal of the derivative at `x`.
-macro_rules! over {
-    ($($f:ident: |$x:ident| $y:expr, $over:expr;)*) => {
-        $(
-            #[inline(always)]
-            fn $f(self) -> Self {
-                let $x = self.value;
-                self.over($y, $over)
+                self.map(
+                    $x.$f(),
+                    #[inline(always)]
+                    |$s| $slope,
+                )
             }
         )*
     };
@@ -240,32 +210,30 @@ impl<E: Real, const N: usize> Real for Dual<E, N> {
             |s, t| x.if_positive(s, t),
         )
     }
-    chain! {
-        exp: |x| x.exp(), x.exp();
-        expm1: |x| x.expm1(), x.exp();
-        sin: |x| x.sin(), x.cos();
-        cos: |x| x.cos(), -x.sin();
-        sin_pi: |x| x.sin_pi(), x.like(PI) * x.cos_pi();
-        cos_pi: |x| x.cos_pi(), x.like(-PI) * x.sin_pi();
-        // As products that keep their digits where the value is near 1.
-        tanh: |x| x.tanh(), (x.like(1.0) - x.tanh()) * (x.like(1.0) + x.tanh());
-        sigmoid: |x| x.sigmoid(), x.sigmoid() * (-x).sigmoid();
-        softplus: |x| x.softplus(), x.sigmoid();
-        exp2: |x| x.exp2(), x.exp2() * x.like(LN_2);
-        erf: |x| x.erf(), x.like(FRAC_2_SQRT_PI) * (-(x * x)).exp();
-        tan: |x| x.tan(), x.like(1.0) + x.tan() * x.tan();
-        sinh: |x| x.sinh(), x.cosh();
-        cosh: |x| x.cosh(), x.sinh();
-        abs: |x| x.abs(), x.sign();
-    }
-    over! {
-        ln: |x| x.ln(), x;
-        ln1p: |x| x.ln1p(), x.like(1.0) + x;
-        log2: |x| x.log2(), x.like(LN_2) * x;
-        sqrt: |x| x.sqrt(), x.like(2.0) * x.sqrt();
-        asin: |x| x.asin(), complement(x);
-        acos: |x| x.acos(), -complement(x);
-        atan: |x| x.atan(), x.like(1.0) + x * x;
+    slopes! {
+        exp: |s, x| exp_slope(s, x, x.exp());
+        expm1: |s, x| exp_slope(s, x, x.exp());
+        sin: |s, x| s * x.cos();
+        cos: |s, x| -(s * x.sin());
+        sin_pi: |s, x| s * (x.like(PI) * x.cos_pi());
+        cos_pi: |s, x| cos_pi_slope(s, x);
+        tanh: |s, x| tanh_slope(s, x);
+        sigmoid: |s, x| sigmoid_slope(s, x);
+        softplus: |s, x| softplus_slope(s, x);
+        exp2: |s, x| exp2_slope(s, x, x.exp2());
+        erf: |s, x| bell(s, x, -1.0) * x.like(FRAC_2_SQRT_PI);
+        normal_cdf: |s, x| bell(s, x, -0.5) * x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2);
+        tan: |s, x| s * (x.like(1.0) + x.tan() * x.tan());
+        sinh: |s, x| sinh_slope(s, x);
+        cosh: |s, x| cosh_slope(s, x);
+        abs: |s, x| s * x.sign();
+        ln: |s, x| s / x;
+        ln1p: |s, x| s / (x.like(1.0) + x);
+        log2: |s, x| s / x * x.like(LOG2_E);
+        sqrt: |s, x| sqrt_slope(s, x.sqrt());
+        asin: |s, x| s / complement(x);
+        acos: |s, x| -(s / complement(x));
+        atan: |s, x| atan_slope(s, x);
     }
     steps! { sign floor ceil round }
     #[inline(always)]
@@ -275,11 +243,52 @@ impl<E: Real, const N: usize> Real for Dual<E, N> {
             x,
             a.atan2(b),
             #[inline(always)]
-            |s| s * turn(b, a, b),
+            |s| turn(s, b, a, b),
             #[inline(always)]
-            |t| -(t * turn(a, a, b)),
+            |t| -turn(t, a, a, b),
         )
     }
+    #[inline(always)]
+    fn hypot(self, other: Self) -> Self {
+        let (a, b) = (self.value, other.value);
+        let y = a.hypot(b);
+        self.sum(
+            other,
+            y,
+            #[inline(always)]
+            |s| length_slope(s, a, y),
+            #[inline(always)]
+            |t| length_slope(t, b, y),
+        )
+    }
+    #[inline(always)]
+    fn remainder(self, other: Self) -> Self {
+        let (a, b) = (self.value, other.value);
+        let y = a.remainder(b);
+        self.sum(
+            other,
+            y,
+            #[inline(always)]
+            |s| s,
+            #[inline(always)]
+            |t| -multiple(t, a, b, y),
+        )
+    }
+    #[inline(always)]
+    fn mul_add(self, factor: Self, summand: Self) -> Self {
+        let (a, b) = (self.value, factor.value);
+        Dual { value: a.mul_add(b, summand.value), ..self * factor + summand }
+    }
+    #[inline(always)]
+    fn checked<const K: usize, const M: usize>(
+        _quick: Self,
+        _inputs: [Self; K],
+        _factors: [Self; M],
+        exact: impl FnOnce() -> Self,
+    ) -> Self {
+        exact()
+    }
+    type Wide = Plain<Self>;
     #[inline(always)]
     fn powi(self, exponent: i32) -> Self {
         let (x, y) = (self.value, self.value.powi(exponent));
@@ -289,7 +298,7 @@ impl<E: Real, const N: usize> Real for Dual<E, N> {
         self.map(
             y,
             #[inline(always)]
-            |s| s * (x.like(f64::from(exponent)) * x.powi(exponent.saturating_sub(1))),
+            |s| powi_slope(s, x, exponent),
         )
     }
     #[inline(always)]
@@ -300,9 +309,9 @@ impl<E: Real, const N: usize> Real for Dual<E, N> {
             exponent,
             y,
             #[inline(always)]
-            |s| s * slope_of_base(a, b),
+            |s| base_slope(s, a, b, y),
             #[inline(always)]
-            |t| t * slope_of_exponent(a, b, y),
+            |t| exponent_slope(t, a, b, y),
         )
     }
     #[inline(always)]

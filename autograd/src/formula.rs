@@ -3,7 +3,9 @@
 use crate::reading::Reading;
 use crate::recorded::{Recorded, Sheet};
 use crate::{Cases, Dual, Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, broadcast_shape, lanes_fused, map_fused, sum_to};
+use raygrad_tensor::{
+    EXACT, PLAIN, Pool, QUICK, Real, Scalar, Shape, Tensor, broadcast_shape, lanes_fused, map_fused, sum_to,
+};
 use smallvec::SmallVec;
 use std::array::from_fn;
 use std::slice;
@@ -46,6 +48,11 @@ pub trait Formula<const N: usize>: Copy + Send + Sync + 'static {
     /// Whether to evaluate the formula first with a short argument reduction for sines and cosines. They then take a
     /// third of the time, with the same bits (see [`raygrad_tensor::Lane`]). All kernels are compiled twice.
     const ANGLES: bool = false;
+    /// Whether the function uses [`Real::checked`], with quick products first and those of any range where they are
+    /// necessary. The kernel of the value is then compiled twice.
+    const WIDE_VALUE: bool = false;
+    /// The same for the gradients.
+    const WIDE_GRADIENT: bool = false;
 
     /// The function.
     fn f<E: Real>(&self, x: [E; N]) -> E;
@@ -116,44 +123,40 @@ impl<F: Formula<N>, const N: usize> Elementwise<F, N> {
 
     /// All gradients of a block: `x` are g, y and the operands.
     fn gradients<T: Scalar>(&self, x: &[&[T]], out: &mut [&mut [T]]) {
-        if F::ANGLES {
-            let outside = lanes_fused::<T, true, 2, N, N>(
-                x,
-                out,
-                #[inline(always)]
-                |[g, y], x| self.0.vjp(g, x, y),
-            );
-            if !outside {
-                return;
-            }
+        if !F::ANGLES && !F::WIDE_GRADIENT {
+            self.gradients_in::<T, PLAIN>(x, out);
+        } else if self.gradients_in::<T, QUICK>(x, out) {
+            self.gradients_in::<T, EXACT>(x, out);
         }
-        lanes_fused::<T, false, 2, N, N>(
+    }
+
+    #[inline(always)]
+    fn gradients_in<T: Scalar, const MODE: u8>(&self, x: &[&[T]], out: &mut [&mut [T]]) -> bool {
+        lanes_fused::<T, MODE, 2, N, N>(
             x,
             out,
             #[inline(always)]
             |[g, y], x| self.0.vjp(g, x, y),
-        );
+        )
     }
 
     /// The values of a block.
     fn values<T: Scalar>(&self, x: &[&[T]], out: &mut [&mut [T]]) {
-        if F::ANGLES {
-            let outside = lanes_fused::<T, true, 0, N, 1>(
-                x,
-                out,
-                #[inline(always)]
-                |[], x| [self.0.f(x)],
-            );
-            if !outside {
-                return;
-            }
+        if !F::ANGLES && !F::WIDE_VALUE {
+            self.values_in::<T, PLAIN>(x, out);
+        } else if self.values_in::<T, QUICK>(x, out) {
+            self.values_in::<T, EXACT>(x, out);
         }
-        lanes_fused::<T, false, 0, N, 1>(
+    }
+
+    #[inline(always)]
+    fn values_in<T: Scalar, const MODE: u8>(&self, x: &[&[T]], out: &mut [&mut [T]]) -> bool {
+        lanes_fused::<T, MODE, 0, N, 1>(
             x,
             out,
             #[inline(always)]
             |[], x| [self.0.f(x)],
-        );
+        )
     }
 }
 
@@ -336,7 +339,7 @@ macro_rules! formula {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ops::{activation, arithmetic, exponential, piecewise, trigonometric};
+    use crate::ops::{arithmetic, exponential, piecewise, trigonometric};
 
     #[test]
     fn an_operation_keeps_what_its_gradients_read() {
@@ -348,8 +351,8 @@ mod tests {
         assert_eq!(reads(piecewise::Floor), Reads::NOTHING);
         assert_eq!(reads(arithmetic::Mul), Reads::only(&[0, 1]));
         assert_eq!(reads(trigonometric::Sin), Reads::only(&[0]));
-        assert_eq!(reads(exponential::Exp), Reads::OUTPUT);
-        assert_eq!(reads(activation::Sigmoid), Reads::only(&[0]).and_output());
+        assert_eq!(reads(exponential::Sqrt), Reads::OUTPUT);
+        assert_eq!(reads(trigonometric::Hypot), Reads::only(&[0, 1]).and_output());
         // Of the constant b^0 the gradient of c reads the value, and none reads c.
         assert_eq!(reads(crate::formula!(|x, a, b, c| a * x + b.powi(0) * c)), Reads::only(&[0, 1, 2]));
     }

@@ -41,6 +41,7 @@ mod path;
 mod reading;
 mod recorded;
 mod row_sums;
+mod slopes;
 mod sum;
 mod sweep;
 mod tape;

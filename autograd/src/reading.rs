@@ -1,6 +1,6 @@
 //! Finds the values that a derivative reads, by evaluating the derivative on numbers that track them.
 
-use raygrad_tensor::Real;
+use raygrad_tensor::{Plain, Real};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
 /// A number without a value, which tracks the numbers that it was computed from.
@@ -82,5 +82,19 @@ impl Real for Reading {
     fn powi(self, _exponent: i32) -> Self {
         Reading::of(self.of)
     }
+    #[inline(always)]
+    fn mul_add(self, factor: Self, summand: Self) -> Self {
+        Reading::of(self.of | factor.of | summand.of)
+    }
+    #[inline(always)]
+    fn checked<const K: usize, const M: usize>(
+        quick: Self,
+        _inputs: [Self; K],
+        _factors: [Self; M],
+        exact: impl FnOnce() -> Self,
+    ) -> Self {
+        Reading::of(quick.of | exact().of)
+    }
+    type Wide = Plain<Self>;
     raygrad_tensor::functions!(reading());
 }

@@ -1,7 +1,7 @@
 //! Formulas on a tape: numbers that stand for variables.
 
 use crate::Var;
-use raygrad_tensor::{Real, Scalar};
+use raygrad_tensor::{Plain, Real, Scalar};
 use std::array::from_fn;
 use std::cell::RefCell;
 use std::ops::{Add, Div, Mul, Neg, Sub};
@@ -172,6 +172,19 @@ impl<T: Scalar> Real for Recorded<'_, '_, T> {
     fn powi(self, exponent: i32) -> Self {
         self.sheet.push(Step::Powi(exponent, self.index))
     }
+    fn mul_add(self, factor: Self, summand: Self) -> Self {
+        self * factor + summand
+    }
+    #[inline(always)]
+    fn checked<const K: usize, const M: usize>(
+        _quick: Self,
+        _inputs: [Self; K],
+        _factors: [Self; M],
+        exact: impl FnOnce() -> Self,
+    ) -> Self {
+        exact()
+    }
+    type Wide = Plain<Self>;
     raygrad_tensor::functions!(recorded());
 }
 

@@ -64,14 +64,14 @@ macro_rules! lanes_real {
         let x: &[&[_]] = $x;
         let out: &mut [_] = $out;
         let is_to_be_plain = !ANGLES
-            || $crate::lanes_fused::<_, true, 0, _, 1>(
+            || $crate::lanes_fused::<_, { $crate::QUICK }, 0, _, 1>(
                 x,
                 &mut [&mut *out],
                 #[inline(always)]
                 |[], $arguments| [$formula],
             );
         if is_to_be_plain {
-            $crate::lanes_fused::<_, false, 0, _, 1>(
+            $crate::lanes_fused::<_, { $crate::PLAIN }, 0, _, 1>(
                 x,
                 &mut [out],
                 #[inline(always)]

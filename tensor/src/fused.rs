@@ -197,15 +197,15 @@ const HELD: usize = 128;
 /// `out[k][i] = f([x[0][i], .., x[K - 1][i]], [x[K][i], .., x[K + N - 1][i]])[k]` with the processor's best instruction
 /// set.
 ///
-/// Returns whether an argument of a sine or cosine was too large for `QUICK` numbers; the results are then invalid (see
+/// Returns whether numbers of mode [`QUICK`](crate::QUICK) were too small or too large; the results are then invalid (see
 /// [`Lane`]).
 ///
 /// # Panics
 /// If there are not `K + N` operands and `M` results, or their lengths differ.
-pub fn lanes_fused<T: Scalar, const QUICK: bool, const K: usize, const N: usize, const M: usize>(
+pub fn lanes_fused<T: Scalar, const MODE: u8, const K: usize, const N: usize, const M: usize>(
     x: &[&[T]],
     out: &mut [&mut [T]],
-    f: impl Fn([Lane<T, QUICK>; K], [Lane<T, QUICK>; N]) -> [Lane<T, QUICK>; M],
+    f: impl Fn([Lane<T, MODE>; K], [Lane<T, MODE>; N]) -> [Lane<T, MODE>; M],
 ) -> bool {
     assert!(x.len() == K + N && out.len() == M, "{} operands and {} results of a formula", x.len(), out.len());
     let n = out.first().map_or(0, |out| out.len());
@@ -287,7 +287,7 @@ fn cut_again<'a, T, const N: usize>(x: &[&'a [T]; N], start: usize, n: usize) ->
 
 /// Element `i` of each slice.
 #[inline(always)]
-fn gather<T: Scalar, const N: usize, const QUICK: bool>(x: &[&[T]; N], i: usize) -> [Lane<T, QUICK>; N] {
+fn gather<T: Scalar, const N: usize, const MODE: u8>(x: &[&[T]; N], i: usize) -> [Lane<T, MODE>; N] {
     let mut values = [Lane::new(T::ZERO); N];
     let mut k = 0;
     while k < N {
@@ -303,7 +303,7 @@ mod tests {
 
     /// The sum and the product of two operands, and the first operand.
     fn block(x: &[&[f32]], out: &mut [&mut [f32]]) {
-        lanes_fused::<f32, false, 1, 1, 3>(x, out, |[a], [b]| [a + b, a * b, a]);
+        lanes_fused::<f32, { crate::PLAIN }, 1, 1, 3>(x, out, |[a], [b]| [a + b, a * b, a]);
     }
 
     #[test]
@@ -330,16 +330,16 @@ mod tests {
 
     #[test]
     fn quick_lane_reports_too_large_angles() {
-        fn sine<const QUICK: bool>(x: f64) -> (bool, f64) {
+        fn sine<const MODE: u8>(x: f64) -> (bool, f64) {
             let mut y = [0.0];
-            let outside = lanes_fused::<f64, QUICK, 0, 1, 1>(&[&[x]], &mut [&mut y], |[], [x]| {
+            let outside = lanes_fused::<f64, MODE, 0, 1, 1>(&[&[x]], &mut [&mut y], |[], [x]| {
                 [crate::Real::sin(x) * crate::Real::like(&x, 1.0)]
             });
             (outside, y[0])
         }
-        assert_eq!(sine::<true>(2.0), (false, crate::Real::sin(2.0)));
-        assert!(sine::<true>(1e30).0);
-        assert_eq!(sine::<false>(1e30), (false, crate::Real::sin(1e30)));
+        assert_eq!(sine::<{ crate::QUICK }>(2.0), (false, crate::Real::sin(2.0)));
+        assert!(sine::<{ crate::QUICK }>(1e30).0);
+        assert_eq!(sine::<{ crate::EXACT }>(1e30), (false, crate::Real::sin(1e30)));
     }
 
     #[test]

@@ -1,23 +1,31 @@
 //! The numbers of a vectorised loop over a formula, with the short reduction of sine and cosine where it is valid.
 
-use crate::{Real, Scalar};
+use crate::real::any_extreme;
+use crate::{Real, Scalar, Wide};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// A number in a loop of [`lanes_fused`](crate::lanes_fused). With `QUICK`, its sine and cosine use the short argument
-/// reduction, and it records whether that was valid. Without, it is a plain number.
+/// The [`Lane`]s of a formula as it is written.
+pub const PLAIN: u8 = 0;
+/// [`Lane`]s that record whether an argument was too large for the short reduction of angles, or a number too small or
+/// too large for quick products ([`Real::checked`]).
+pub const QUICK: u8 = 1;
+/// [`Lane`]s with the full reduction of angles, and products that keep their range where that is necessary.
+pub const EXACT: u8 = 2;
+
+/// A number in a loop of [`lanes_fused`](crate::lanes_fused), in one of the modes [`PLAIN`], [`QUICK`] and [`EXACT`].
 ///
 /// The reduction for arguments of any size takes several times as long as the rest of a sine, and few arguments need
 /// it. A loop cannot branch for each element and stay vectorised. So a formula runs on quick numbers first. Blocks of
-/// elements with an argument that was too large run again on plain numbers. The bits are those of plain numbers in any
-/// case. A formula without sines has no overhead.
+/// elements with an argument that was too large run again, and have the same bits where it was not. A formula without
+/// sines has no overhead. The same holds for products that may leave the range of the type.
 #[derive(Debug, Clone, Copy)]
-pub struct Lane<T: Scalar, const QUICK: bool> {
+pub struct Lane<T: Scalar, const MODE: u8> {
     value: T,
     /// Whether an argument on the way to `value` was too large; see [`Scalar::outside`].
     outside: T::Flags,
 }
 
-impl<T: Scalar, const QUICK: bool> Lane<T, QUICK> {
+impl<T: Scalar, const MODE: u8> Lane<T, MODE> {
     #[inline(always)]
     pub(crate) fn new(value: T) -> Self {
         Lane { value, outside: T::Flags::default() }
@@ -56,7 +64,7 @@ pub const fn has_angle(formula: &str) -> bool {
 
 macro_rules! operator {
     ($trait:ident, $method:ident) => {
-        impl<T: Scalar, const QUICK: bool> $trait for Lane<T, QUICK> {
+        impl<T: Scalar, const MODE: u8> $trait for Lane<T, MODE> {
             type Output = Self;
             #[inline(always)]
             #[allow(clippy::suspicious_arithmetic_impl)] // flags are joined whatever the operator
@@ -72,7 +80,7 @@ operator!(Sub, sub);
 operator!(Mul, mul);
 operator!(Div, div);
 
-impl<T: Scalar, const QUICK: bool> Neg for Lane<T, QUICK> {
+impl<T: Scalar, const MODE: u8> Neg for Lane<T, MODE> {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
@@ -90,7 +98,7 @@ macro_rules! lane {
     (angle $f:ident $quick:ident) => {
         #[inline(always)]
         fn $f(self) -> Self {
-            if QUICK {
+            if MODE == QUICK {
                 Lane { value: self.value.$quick(), outside: self.outside | self.value.outside() }
             } else {
                 self.with(self.value.$f())
@@ -111,7 +119,7 @@ macro_rules! lane {
     };
 }
 
-impl<T: Scalar, const QUICK: bool> Real for Lane<T, QUICK> {
+impl<T: Scalar, const MODE: u8> Real for Lane<T, MODE> {
     #[inline(always)]
     fn like(&self, value: f64) -> Self {
         Lane::new(T::from_f64(value))
@@ -125,6 +133,95 @@ impl<T: Scalar, const QUICK: bool> Real for Lane<T, QUICK> {
     #[inline(always)]
     fn powi(self, exponent: i32) -> Self {
         self.with(self.value.powi(exponent))
+    }
+    #[inline(always)]
+    fn mul_add(self, factor: Self, summand: Self) -> Self {
+        let outside = self.outside | factor.outside | summand.outside;
+        Lane { value: self.value.mul_add(factor.value, summand.value), outside }
+    }
+    #[inline(always)]
+    fn checked<const K: usize, const M: usize>(
+        quick: Self,
+        inputs: [Self; K],
+        factors: [Self; M],
+        exact: impl FnOnce() -> Self,
+    ) -> Self {
+        if MODE == PLAIN {
+            return quick;
+        }
+        let (mut given, mut made, mut k) = ([quick.value; K], [quick.value; M], 0);
+        while k < K {
+            given[k] = inputs[k].value;
+            k += 1;
+        }
+        k = 0;
+        while k < M {
+            made[k] = factors[k].value;
+            k += 1;
+        }
+        let flags = any_extreme(given, made);
+        if MODE == QUICK {
+            return Lane { value: quick.value, outside: quick.outside | flags };
+        }
+        let value = exact().value;
+        quick.with(if T::is_set(flags) { value } else { quick.value })
+    }
+    type Wide = WideLane<T, MODE>;
+}
+
+/// A [`Wide`] product of [`Lane`]s.
+#[derive(Debug, Clone, Copy)]
+pub struct WideLane<T: Scalar, const MODE: u8> {
+    value: T::Wide,
+    outside: T::Flags,
+}
+
+macro_rules! wide {
+    ($trait:ident, $method:ident) => {
+        impl<T: Scalar, const MODE: u8> $trait for WideLane<T, MODE> {
+            type Output = Self;
+            #[inline(always)]
+            #[allow(clippy::suspicious_arithmetic_impl)] // flags are joined whatever the operator
+            fn $method(self, other: Self) -> Self {
+                WideLane { value: self.value.$method(other.value), outside: self.outside | other.outside }
+            }
+        }
+    };
+    ($($f:ident($first:ident, $second:ident))+) => {
+        $(
+            #[inline(always)]
+            fn $f($first: Lane<T, MODE>, $second: Lane<T, MODE>) -> Self {
+                WideLane { value: Wide::$f($first.value, $second.value), outside: $first.outside | $second.outside }
+            }
+        )+
+    };
+}
+
+wide!(Mul, mul);
+wide!(Div, div);
+
+impl<T: Scalar, const MODE: u8> Wide<Lane<T, MODE>> for WideLane<T, MODE> {
+    #[inline(always)]
+    fn new(x: Lane<T, MODE>) -> Self {
+        WideLane { value: x.value.wide(), outside: x.outside }
+    }
+    wide!(exp(x, low) sigmoid(x, low));
+    #[inline(always)]
+    fn normal_cdf(x: Lane<T, MODE>) -> Self {
+        WideLane { value: Wide::normal_cdf(x.value), outside: x.outside }
+    }
+    #[inline(always)]
+    fn pow(base: Lane<T, MODE>, exponent: Lane<T, MODE>, y: Lane<T, MODE>) -> Self {
+        let outside = base.outside | exponent.outside | y.outside;
+        WideLane { value: Wide::pow(base.value, exponent.value, y.value), outside }
+    }
+    #[inline(always)]
+    fn powi(base: Lane<T, MODE>, exponent: i32) -> Self {
+        WideLane { value: Wide::powi(base.value, exponent), outside: base.outside }
+    }
+    #[inline(always)]
+    fn narrow(self) -> Lane<T, MODE> {
+        Lane { value: self.value.narrow(), outside: self.outside }
     }
 }
 

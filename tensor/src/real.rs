@@ -1,6 +1,6 @@
 //! The number types that an elementwise formula can be evaluated on.
 
-use crate::vmath;
+use crate::{Scalar, vmath};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
 /// The list of functions of [`Real`]. `functions!(each(arguments))` expands to
@@ -27,6 +27,7 @@ macro_rules! functions {
             unary exp2 "`2^x`.";
             unary log2 "The logarithm to base 2: -inf at 0, NaN below.";
             unary erf "The error function.";
+            unary normal_cdf "The distribution function of the standard normal distribution, accurate in both tails.";
             unary tan "Tangent of an angle in radians.";
             unary asin "The angle in -pi/2..=pi/2 of this sine; NaN outside -1..=1.";
             unary acos "The angle in 0..=pi of this cosine; NaN outside -1..=1.";
@@ -39,6 +40,8 @@ macro_rules! functions {
             unary ceil "The next whole number above.";
             unary round "The nearest whole number, the even one of two.";
             binary atan2 "The angle in -pi..=pi of the vector (`other`, `self`).";
+            binary hypot "The length of the vector (`self`, `other`), without overflow or underflow of the squares.";
+            binary remainder "`self` modulo `other`, with the sign of `other`; NaN for 0 or an infinite `self`.";
             binary pow "`self` to a real power; NaN for a negative base and a fractional exponent.";
             binary maximum "The greater of two numbers; NaN if one of them is.";
             binary minimum "The smaller of two numbers; NaN if one of them is.";
@@ -77,6 +80,119 @@ pub trait Real:
     crate::functions!(declared());
     /// `self` to an integer power. Exponent 0 gives 1 for any base.
     fn powi(self, exponent: i32) -> Self;
+    /// `self * factor + summand`, rounded once on floats.
+    fn mul_add(self, factor: Self, summand: Self) -> Self;
+
+    /// `quick`, or `exact` where `quick` may have left the range of the type on the way: where one of the `inputs` is
+    /// neither 0 nor within 2^-63 and 2^63 (2^-511 and 2^511 for f64), or one of the `factors` is not.
+    fn checked<const K: usize, const M: usize>(
+        quick: Self,
+        inputs: [Self; K],
+        factors: [Self; M],
+        exact: impl FnOnce() -> Self,
+    ) -> Self;
+
+    /// Products and quotients of numbers of this type, of which no part overflows or underflows.
+    type Wide: Wide<Self>;
+
+    /// This number as a factor of a [`Wide`] product.
+    #[inline(always)]
+    fn wide(self) -> Self::Wide {
+        Self::Wide::new(self)
+    }
+}
+
+/// A product of numbers with more range than their type: no part of it overflows or underflows. Dual numbers and those
+/// that stand for variables use ordinary products, [`Plain`].
+///
+/// ```
+/// use raygrad_tensor::{Real, Wide};
+/// let product = 1e30_f32.wide() * Wide::exp(-100.0, 0.0);
+/// assert_eq!(product.narrow(), 3.7200759e-14);
+/// assert_eq!(1e30 * f32::exp(-100.0), 3.7835059e-14);
+/// ```
+pub trait Wide<E>: Copy + Mul<Output = Self> + Div<Output = Self> {
+    /// The number `x`.
+    fn new(x: E) -> Self;
+    /// `e^(x + low)`, for a rounding error `low` of x.
+    fn exp(x: E, low: E) -> Self;
+    /// `1 / (1 + e^-(x + low))`, for a rounding error `low` of x.
+    fn sigmoid(x: E, low: E) -> Self;
+    /// The distribution function of the standard normal distribution.
+    fn normal_cdf(x: E) -> Self;
+    /// `base` to a real power, of which `y` is the rounded value.
+    fn pow(base: E, exponent: E, y: E) -> Self;
+    /// `base` to an integer power.
+    fn powi(base: E, exponent: i32) -> Self;
+    /// The product, rounded to the number type.
+    fn narrow(self) -> E;
+}
+
+/// A [`Wide`] number by ordinary arithmetic.
+#[derive(Debug, Clone, Copy)]
+pub struct Plain<E>(E);
+
+impl<E: Mul<Output = E>> Mul for Plain<E> {
+    type Output = Self;
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        Plain(self.0 * other.0)
+    }
+}
+
+impl<E: Div<Output = E>> Div for Plain<E> {
+    type Output = Self;
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        Plain(self.0 / other.0)
+    }
+}
+
+impl<E: Real> Wide<E> for Plain<E> {
+    #[inline(always)]
+    fn new(x: E) -> Self {
+        Plain(x)
+    }
+    #[inline(always)]
+    fn exp(x: E, _low: E) -> Self {
+        Plain(x.exp())
+    }
+    #[inline(always)]
+    fn sigmoid(x: E, _low: E) -> Self {
+        Plain(x.sigmoid())
+    }
+    #[inline(always)]
+    fn normal_cdf(x: E) -> Self {
+        Plain(x.normal_cdf())
+    }
+    #[inline(always)]
+    fn pow(_base: E, _exponent: E, y: E) -> Self {
+        Plain(y)
+    }
+    #[inline(always)]
+    fn powi(base: E, exponent: i32) -> Self {
+        Plain(base.powi(exponent))
+    }
+    #[inline(always)]
+    fn narrow(self) -> E {
+        self.0
+    }
+}
+
+/// The flags of [`Real::checked`].
+#[inline(always)]
+pub(crate) fn any_extreme<T: Scalar, const K: usize, const M: usize>(inputs: [T; K], factors: [T; M]) -> T::Flags {
+    let (mut flags, mut k) = (T::Flags::default(), 0);
+    while k < K {
+        flags = flags | inputs[k].is_extreme();
+        k += 1;
+    }
+    k = 0;
+    while k < M {
+        flags = flags | factors[k].is_extreme_or_zero();
+        k += 1;
+    }
+    flags
 }
 
 macro_rules! number {
@@ -119,6 +235,20 @@ macro_rules! real {
                     _ => f64::powf(self as f64, f64::from(exponent)) as $t,
                 }
             }
+            #[inline(always)]
+            fn mul_add(self, factor: Self, summand: Self) -> Self {
+                $t::mul_add(self, factor, summand)
+            }
+            #[inline(always)]
+            fn checked<const K: usize, const M: usize>(
+                quick: Self,
+                inputs: [Self; K],
+                factors: [Self; M],
+                exact: impl FnOnce() -> Self,
+            ) -> Self {
+                if $t::is_set(any_extreme(inputs, factors)) { exact() } else { quick }
+            }
+            type Wide = vmath::wide::$t::Wide;
         }
     };
 }

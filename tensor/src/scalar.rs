@@ -58,6 +58,12 @@ pub trait Scalar:
     /// Flagged if `sin_quick` and `cos_quick` are not valid for this number. NaN is flagged, infinities are too.
     #[doc(hidden)]
     fn outside(self) -> Self::Flags;
+    /// Flagged if the exponent is not in the middle half of its range. Zero is not flagged, NaN is.
+    #[doc(hidden)]
+    fn is_extreme(self) -> Self::Flags;
+    /// Flagged if 0, or [`is_extreme`](Self::is_extreme).
+    #[doc(hidden)]
+    fn is_extreme_or_zero(self) -> Self::Flags;
     /// Whether the flag is set.
     #[doc(hidden)]
     fn is_set(flags: Self::Flags) -> bool;
@@ -86,7 +92,7 @@ pub trait Scalar:
 }
 
 macro_rules! scalar {
-    ($t:ident, $bits:ident, $gemm:ident, $matrixmultiply:path) => {
+    ($t:ident, $bits:ident, $least:expr, $gemm:ident, $matrixmultiply:path) => {
         impl Scalar for $t {
             const NAME: &'static str = stringify!($t);
             const ZERO: Self = 0.0;
@@ -119,6 +125,18 @@ macro_rules! scalar {
             fn outside(self) -> $bits {
                 // Below zero, and so with its highest bit set, where |x| is greater.
                 vmath::$t::QUICK.to_bits().wrapping_sub(self.abs().to_bits())
+            }
+            #[inline(always)]
+            fn is_extreme(self) -> $bits {
+                // The highest bit of minus a positive number is set.
+                self.is_extreme_or_zero() & self.abs().to_bits().wrapping_neg()
+            }
+            #[inline(always)]
+            fn is_extreme_or_zero(self) -> $bits {
+                // A difference has its highest bit set where it is below zero.
+                let (least, bits) = ($least.to_bits(), self.abs().to_bits());
+                let greatest = $t::to_bits(1.0 / $least);
+                bits.wrapping_sub(least) | greatest.wrapping_sub(bits)
             }
             #[inline(always)]
             fn is_set(flags: $bits) -> bool {
@@ -190,5 +208,6 @@ macro_rules! scalar {
     };
 }
 
-scalar!(f32, u32, gemm_f32, matrixmultiply::sgemm);
-scalar!(f64, u64, gemm_f64, matrixmultiply::dgemm);
+// The roots of the smallest normal numbers.
+scalar!(f32, u32, 1.084_202_2e-19_f32, gemm_f32, matrixmultiply::sgemm);
+scalar!(f64, u64, 1.491_668_146_240_041_3e-154_f64, gemm_f64, matrixmultiply::dgemm);

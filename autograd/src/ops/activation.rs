@@ -1,8 +1,9 @@
 //! Activation functions.
 
 use crate::cases::INF;
+use crate::slopes::{at_least, at_most, bell, near_sigmoid, wide_bell, wide_sigmoid};
 use crate::{Cases, Formula, Var};
-use raygrad_tensor::{Real, Scalar};
+use raygrad_tensor::{Real, Scalar, Wide};
 use std::f64::consts::{FRAC_1_SQRT_2, FRAC_2_SQRT_PI};
 
 /// y = max(x, 0), NaN for NaN; dx = g where x > 0, else 0 (also at the kink).
@@ -28,18 +29,15 @@ impl Formula<1> for Relu {
     }
 }
 
-/// y = 1 / (1 + e^-x); dx = g s(x) s(-x), which keeps digits where y is near 1.
+/// y = 1 / (1 + e^-x); dx = g s(x) s(-x).
 #[derive(Clone, Copy)]
 pub struct Sigmoid;
 impl Formula<1> for Sigmoid {
     const NAME: &'static str = "sigmoid";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.sigmoid()
-    }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], y: E) -> [E; 1] {
-        [g * (y * (-x).sigmoid())]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.5, [0.25]).at([-INF], 0.0, [0.0]).at([INF], 1.0, [0.0]);
@@ -52,6 +50,7 @@ impl Formula<1> for Sigmoid {
 pub struct Softplus;
 impl Formula<1> for Softplus {
     const NAME: &'static str = "softplus";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.softplus()
@@ -67,6 +66,7 @@ impl Formula<1> for Softplus {
 pub struct LogSigmoid;
 impl Formula<1> for LogSigmoid {
     const NAME: &'static str = "log_sigmoid";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         -(-x).softplus()
@@ -105,11 +105,21 @@ pub struct Elu {
 }
 impl Formula<1> for Elu {
     const NAME: &'static str = "elu";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         // Of min(x, 0): the branch not taken must not overflow either, or the second derivative would be NaN.
         let below = x.like(self.alpha) * x.if_positive(x.like(0.0), x).expm1();
         x.if_positive(x, below)
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
+        // Of min(x, 0), whose exponential is 1 above.
+        let zero = x.like(0.0);
+        let (below, alpha) = (x.if_positive(zero, x), x.if_positive(x.like(1.0), x.like(self.alpha)));
+        let y = below.exp();
+        let exact = || (g.wide() * E::Wide::exp(below, zero) * alpha.wide()).narrow();
+        [E::checked(g * (y * alpha), [], [y, alpha], exact)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
@@ -127,18 +137,24 @@ impl Formula<1> for Elu {
 pub struct Gelu;
 impl Formula<1> for Gelu {
     const NAME: &'static str = "gelu";
+    const WIDE_VALUE: bool = true;
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
-        let (half, root) = (x.like(0.5), x.like(FRAC_1_SQRT_2));
-        let share = half + half * (x * root).erf();
-        scaled(x, share)
+        let x = at_least(x, -FAR);
+        let share = x.normal_cdf();
+        E::checked(x * share, [x], [share], || (x.wide() * E::Wide::normal_cdf(x)).narrow())
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
-        let (half, root) = (x.like(0.5), x.like(FRAC_1_SQRT_2));
-        let share = half + half * (x * root).erf();
-        let density = x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2) * (-(half * (x * x))).exp();
-        [g * (share + scaled(x, density))]
+        let x = at_most(at_least(x, -FAR), FAR);
+        let peak = x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2);
+        let (share, density) = (x.normal_cdf(), peak * bell(x, x, -0.5));
+        let exact = || {
+            let share = (g.wide() * E::Wide::normal_cdf(x)).narrow();
+            share + (g.wide() * (peak * x).wide() * wide_bell(x, -0.5)).narrow()
+        };
+        [E::checked(g * (share + density), [density], [share], exact)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at(
@@ -154,20 +170,27 @@ impl Formula<1> for Gelu {
 pub struct GeluTanh;
 impl Formula<1> for GeluTanh {
     const NAME: &'static str = "gelu_tanh";
+    const WIDE_VALUE: bool = true;
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
-        let share = gelu_argument(x).sigmoid();
-        scaled(x, share)
+        let x = at_least(x, -FAR);
+        let [u, low] = gelu_argument(at_most(x, FAR));
+        let share = near_sigmoid(u, low);
+        E::checked(x * share, [x], [share], || (x.wide() * E::Wide::sigmoid(u, low)).narrow())
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
-        let u = gelu_argument(x);
-        let share = u.sigmoid();
-        let density = share * (-u).sigmoid();
-        let (scale, cubic) = (x.like(GELU_SCALE), x.like(3.0 * GELU_CUBIC));
-        // Where the density is 0, its factor may be infinite.
-        let slope = scale + scale * cubic * (x * x);
-        [g * (share + scaled(x * slope, density))]
+        let x = at_most(at_least(x, -FAR), FAR);
+        let [u, low] = gelu_argument(x);
+        let share = near_sigmoid(u, low);
+        let slope = x * (x.like(GELU_SCALE) + x.like(3.0 * GELU_SCALE * GELU_CUBIC) * (x * x));
+        let density = share * near_sigmoid(-u, -low);
+        let exact = || {
+            let share = g.wide() * E::Wide::sigmoid(u, low);
+            share.narrow() + (share * E::Wide::sigmoid(-u, -low) * slope.wide()).narrow()
+        };
+        [E::checked(g * (share + density * slope), [slope], [share, density], exact)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at([1e30], 1e30, [1.0]);
@@ -180,16 +203,24 @@ impl Formula<1> for GeluTanh {
 pub struct Silu;
 impl Formula<1> for Silu {
     const NAME: &'static str = "silu";
+    const WIDE_VALUE: bool = true;
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        let x = at_least(x, -FAR);
         let share = x.sigmoid();
-        scaled(x, share)
+        E::checked(x * share, [x], [share], || (x.wide() * wide_sigmoid(x)).narrow())
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
+        let x = at_most(at_least(x, -FAR), FAR);
         let share = x.sigmoid();
         let density = share * (-x).sigmoid();
-        [g * (share + scaled(x, density))]
+        let exact = || {
+            let share = g.wide() * wide_sigmoid(x);
+            share.narrow() + (share * wide_sigmoid(-x) * x.wide()).narrow()
+        };
+        [E::checked(g * (share + x * density), [x], [share, density], exact)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]);
@@ -197,22 +228,31 @@ impl Formula<1> for Silu {
     }
 }
 
-/// `x share` for a factor `share` that tends to 0 faster than x grows: 0 where the factor is 0, not NaN.
-#[inline(always)]
-fn scaled<E: Real>(x: E, share: E) -> E {
-    let product = x * share;
-    share.if_positive(product, share)
-}
+/// Where an activation has long reached its limits, but the square is still in range.
+const FAR: f64 = 1e4;
 
-const GELU_SCALE: f64 = 1.595_769_121_605_730_7; // 2 sqrt(2/pi)
 const GELU_CUBIC: f64 = 0.044_715;
+const GELU_SCALE: f64 = 1.595_769_121_605_730_7; // 2 sqrt(2/pi)
+/// The scale and its product with the cubic coefficient in two parts. The first has 11 bits.
+const GELU_PARTS: [[f64; 2]; 2] = [[1.595703125, 6.599660573071176e-05], [0.07135009765625, 4.718616350248776e-06]];
 
-/// Twice the argument of tanh in [`GeluTanh`].
+/// Twice the argument of tanh in [`GeluTanh`], and its rounding error, which counts as many times as the argument is
+/// large.
 #[inline(always)]
-fn gelu_argument<E: Real>(x: E) -> E {
-    let (scale, cubic) = (x.like(GELU_SCALE), x.like(GELU_CUBIC));
-    let cube = x * x * x;
-    scale * (x + cubic * cube)
+fn gelu_argument<E: Real>(x: E) -> [E; 2] {
+    let [[scale, scale_low], [cubic, cubic_low]] = GELU_PARTS;
+    let (scale, scale_low, cubic, cubic_low) = (x.like(scale), x.like(scale_low), x.like(cubic), x.like(cubic_low));
+    let square = x * x;
+    let square_low = x.mul_add(x, -square);
+    let product = cubic * square;
+    let product_low = cubic.mul_add(square, -product) + (cubic_low * square + cubic * square_low);
+    let slope = scale + product;
+    // The rounding error of a sum (Knuth's two-sum).
+    let back = slope - scale;
+    let slope_low = (product - back) + (scale - (slope - back)) + (product_low + scale_low);
+    let rounded = slope + slope_low;
+    let u = x * rounded;
+    [u, x.mul_add(rounded, -u) + x * (slope_low - (rounded - slope))]
 }
 
 impl<'t, T: Scalar> Var<'t, T> {

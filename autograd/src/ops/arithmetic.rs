@@ -1,6 +1,7 @@
 //! Addition, subtraction, multiplication and division, also with constants.
 
 use super::power::ConstPowi;
+use crate::slopes::multiple;
 use crate::{Cases, Formula, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, map};
 
@@ -50,11 +51,12 @@ impl Formula<2> for Mul {
     }
 }
 
-/// y = a / b; da = g / b, db = -g y / b. Division by 0 follows IEEE 754.
+/// y = a / b; da = g / b, db = -g a / b^2. Division by 0 follows IEEE 754.
 #[derive(Clone, Copy)]
 pub struct Div;
 impl Formula<2> for Div {
     const NAME: &'static str = "div";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a / b
@@ -66,7 +68,27 @@ impl Formula<2> for Div {
     }
 }
 
-/// y = scale x + shift.
+/// y = a - b floor(a / b), with the sign of b; da = g, db = -g floor(a / b).
+#[derive(Clone, Copy)]
+pub struct Remainder;
+impl Formula<2> for Remainder {
+    const NAME: &'static str = "remainder";
+    const WIDE_GRADIENT: bool = true;
+    #[inline(always)]
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
+        a.remainder(b)
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], y: E) -> [E; 2] {
+        [g, -multiple(g, a, b, y)]
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(2.1..2.6).domain_also(4.1..4.4).domain(0.9..1.0);
+        c.at([-1.0, 3.0], 2.0, [1.0, 1.0]).at([7.0, -3.0], -2.0, [1.0, 3.0]).at([6.0, 3.0], 0.0, [1.0, -2.0]);
+    }
+}
+
+/// y = scale x + shift, rounded once.
 #[derive(Clone, Copy)]
 pub struct Affine {
     /// The factor.
@@ -79,7 +101,7 @@ impl Formula<1> for Affine {
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let (scale, shift) = (x.like(self.scale), x.like(self.shift));
-        x * scale + shift
+        x.mul_add(scale, shift)
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], self.shift, [self.scale]);
@@ -195,5 +217,12 @@ impl<'t, T: Scalar> Var<'t, T> {
 }
 
 elementwise! {
+    /// `self` modulo `divisor`, as in Python: `self - divisor * floor(self / divisor)`, with the sign of `divisor`. Shapes
+    /// broadcast.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    #[doc(alias = "fmod")]
+    remainder(divisor) = Remainder;
     also examined: Add, Sub, Mul, Div, Affine { scale: -2.5, shift: 0.75 }, Alias;
 }

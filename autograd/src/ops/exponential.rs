@@ -1,23 +1,24 @@
 //! Exponentials, logarithms, square roots and the error function.
 
 use crate::cases::INF;
+use crate::slopes::{corrected_sigmoid, exp_slope, exp2_slope, sqrt_slope};
 use crate::{Cases, Formula};
-use raygrad_tensor::Real;
-use std::f64::consts::LN_2;
-use std::f64::consts::{FRAC_2_SQRT_PI, LOG2_E};
+use raygrad_tensor::{Real, Wide};
+use std::f64::consts::{FRAC_1_SQRT_2, FRAC_2_SQRT_PI, LN_2, LOG2_E};
 
-/// y = e^x; dx = g y.
+/// y = e^x; dx = g e^x.
 #[derive(Clone, Copy)]
 pub struct Exp;
 impl Formula<1> for Exp {
     const NAME: &'static str = "exp";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.exp()
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
-        [g * y]
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], y: E) -> [E; 1] {
+        [exp_slope(g, x, y)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([-INF], 0.0, [0.0]).at([-1000.0], 0.0, [0.0]).at([INF], INF, [INF]);
@@ -29,6 +30,7 @@ impl Formula<1> for Exp {
 pub struct Expm1;
 impl Formula<1> for Expm1 {
     const NAME: &'static str = "expm1";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.expm1()
@@ -77,27 +79,26 @@ impl Formula<1> for Sqrt {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
-        let half = g.like(0.5);
-        [g * half / y]
+        [sqrt_slope(g, y)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], 0.0, [INF]).at([4.0], 2.0, [0.25]).at([INF], INF, [0.0]);
     }
 }
 
-/// y = 2^x; dx = g y ln 2.
+/// y = 2^x; dx = g 2^x ln 2.
 #[derive(Clone, Copy)]
 pub struct Exp2;
 impl Formula<1> for Exp2 {
     const NAME: &'static str = "exp2";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.exp2()
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
-        let ln_2 = g.like(LN_2);
-        [g * (y * ln_2)]
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], y: E) -> [E; 1] {
+        [exp2_slope(g, x, y)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([3.0], 8.0, [8.0 * LN_2]).at([-INF], 0.0, [0.0]).at([INF], INF, [INF]);
@@ -123,6 +124,7 @@ impl Formula<1> for Log2 {
 pub struct Rsqrt;
 impl Formula<1> for Rsqrt {
     const NAME: &'static str = "rsqrt";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let one = x.like(1.0);
@@ -130,8 +132,9 @@ impl Formula<1> for Rsqrt {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
-        let half = g.like(-0.5);
-        [g * half * (y * y * y)]
+        let half = y.like(-0.5);
+        let exact = || (g.wide() * half.wide() * y.wide() * y.wide() * y.wide()).narrow();
+        [E::checked(g * y * y * (y * half), [g], [], exact)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], INF, [-INF]).at([4.0], 0.5, [-0.0625]).at([INF], 0.0, [0.0]);
@@ -144,12 +147,67 @@ impl Formula<1> for Rsqrt {
 pub struct Erf;
 impl Formula<1> for Erf {
     const NAME: &'static str = "erf";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.erf()
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [FRAC_2_SQRT_PI]).at([-INF], -1.0, [0.0]).at([30.0], 1.0, [0.0]);
+    }
+}
+
+/// y = (1 + erf(x / sqrt 2)) / 2; dx = g e^(-x^2 / 2) / sqrt(2 pi).
+#[derive(Clone, Copy)]
+pub struct NormalCdf;
+impl Formula<1> for NormalCdf {
+    const NAME: &'static str = "normal_cdf";
+    const WIDE_GRADIENT: bool = true;
+    #[inline(always)]
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        x.normal_cdf()
+    }
+    fn cases(&self, c: &mut Cases) {
+        let peak = 0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2;
+        c.domain(-3.0..3.0).at([0.0], 0.5, [peak]).at([-INF], 0.0, [0.0]).at([INF], 1.0, [0.0]);
+        c.at([-8.0], 6.220_960_574_271_785e-16, [5.052_271_083_536_893e-15]);
+    }
+}
+
+/// y = ln(e^a + e^b); da = g s(a - b), db = g s(b - a). Of equal infinities it is their value, and each gets half.
+#[derive(Clone, Copy)]
+pub struct LogAddExp;
+impl LogAddExp {
+    /// a - b, where equal infinities are no distance apart, and its rounding error (Knuth's two-sum).
+    #[inline(always)]
+    fn difference<E: Real>(a: E, b: E) -> [E; 2] {
+        let (zero, one, difference) = (a.like(0.0), a.like(1.0), a - b);
+        let of_infinities = difference.abs().if_positive(difference, a.sign() - b.sign());
+        let difference = (one + (a + b) * zero).if_positive(difference, of_infinities);
+        let back = difference + b;
+        let low = (a - back) + ((back - difference) - b);
+        // That of an infinity is no number.
+        [difference, (one - low.abs()).if_positive(low, zero)]
+    }
+}
+impl Formula<2> for LogAddExp {
+    const NAME: &'static str = "logaddexp";
+    const WIDE_GRADIENT: bool = true;
+    #[inline(always)]
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
+        let [difference, low] = LogAddExp::difference(a, b);
+        let (tail, low) = ((-difference.abs()).exp(), difference.if_positive(-low, low));
+        a.maximum(b) + tail.mul_add(low, tail).ln1p()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
+        let [difference, low] = LogAddExp::difference(a, b);
+        [corrected_sigmoid(g, difference, low), corrected_sigmoid(g, -difference, -low)]
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).domain(-3.0..3.0).at([0.0, 0.0], LN_2, [0.5, 0.5]).at([1e4, 1e4], 1e4 + LN_2, [0.5, 0.5]);
+        c.at([-INF, 2.0], 2.0, [0.0, 1.0]).at([-INF, -INF], -INF, [0.5, 0.5]).at([INF, INF], INF, [0.5, 0.5]);
+        c.at([-100.0, 0.0], 3.720_075_976_020_836e-44, [3.720_075_976_020_836e-44, 1.0]);
     }
 }
 
@@ -174,4 +232,12 @@ elementwise! {
     rsqrt() = Rsqrt;
     /// The error function, `2/sqrt(pi) * integral from 0 to self of e^-t^2 dt`.
     erf() = Erf;
+    /// The distribution function of the standard normal distribution, accurate in both tails.
+    #[doc(alias = "ndtr")]
+    normal_cdf() = NormalCdf;
+    /// `ln(e^self + e^other)`, without overflow. Shapes broadcast. Of two equal infinities each gets half of the gradient.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    logaddexp(other) = LogAddExp;
 }

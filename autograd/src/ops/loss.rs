@@ -2,6 +2,7 @@
 
 use crate::cases::INF;
 use crate::error::ensure;
+use crate::slopes::{product_over, scaled_difference, softplus_slope};
 use crate::{Cases, Formula, Grads, Op, Operand, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
 use raygrad_tensor::{Indices, Pool, Real, Scalar, Shape, Tensor};
@@ -45,13 +46,24 @@ pub struct Huber {
 }
 impl Formula<2> for Huber {
     const NAME: &'static str = "huber";
+    const WIDE_VALUE: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         let (half, delta) = (a.like(0.5), a.like(self.delta));
         let r = a - b;
-        let near = half * (r * r);
-        let far = delta * (r.abs() - half * delta);
-        (r.abs() - delta).if_positive(far, near)
+        // With m, the smaller of |r| and delta, both are m (|r| - m / 2).
+        let bounded = (r.abs() - delta).if_positive(delta, r.abs());
+        E::checked(bounded * (r.abs() - half * bounded), [r], [], || {
+            let [scaled, scale] = scaled_difference(a, b);
+            bounded * (scaled.abs() - half * bounded * scale) / scale
+        })
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
+        let (r, delta) = (a - b, a.like(self.delta));
+        let far = r.if_positive(g * delta, -(g * delta));
+        let da = (r.abs() - delta).if_positive(far, g * r);
+        [da, -da]
     }
     fn cases(&self, c: &mut Cases) {
         let d = self.delta;
@@ -70,14 +82,24 @@ pub struct SmoothL1 {
 }
 impl Formula<2> for SmoothL1 {
     const NAME: &'static str = "smooth_l1";
+    const WIDE_VALUE: bool = true;
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         let half = a.like(0.5);
         let (beta, width) = (a.like(self.beta), a.like(self.width()));
         let r = a - b;
-        let near = half * (r * r) / width;
+        let near = half * product_over(r, r, width);
         let far = r.abs() - half * beta;
         (beta - r.abs()).if_positive(near, far)
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
+        let (r, beta, width) = (a - b, a.like(self.beta), a.like(self.width()));
+        let near = product_over(g, r, width);
+        let far = r.if_positive(g, (-r).if_positive(-g, g * r));
+        let da = (beta - r.abs()).if_positive(near, far);
+        [da, -da]
     }
     fn cases(&self, c: &mut Cases) {
         let w = self.beta.max(0.1);
@@ -105,6 +127,7 @@ impl SmoothL1 {
 pub struct BinaryCrossEntropy;
 impl Formula<2> for BinaryCrossEntropy {
     const NAME: &'static str = "binary_cross_entropy_with_logits";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         let (zero, one) = (a.like(0.0), a.like(1.0));
@@ -116,10 +139,9 @@ impl Formula<2> for BinaryCrossEntropy {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
-        // With p = s(-|a|), s(a) is 1 - p or p. At a = 0 it is p, for the sake of the second derivative.
-        let p = a.if_positive(-a, a).sigmoid();
-        let towards = b.like(1.0) - b - p;
-        [g * a.if_positive(towards, p - b), -(g * a)]
+        // s(a) - b is (1 - b) - s(-a). At a = 0 it is the first, for the sake of the second derivative.
+        let share = softplus_slope(g, a.if_positive(-a, a));
+        [a.if_positive(g * (b.like(1.0) - b) - share, share - g * b), -(g * a)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.1..0.9).at([0.0, 1.0], std::f64::consts::LN_2, [-0.5, 0.0]);

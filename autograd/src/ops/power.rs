@@ -1,22 +1,24 @@
 //! Powers, reciprocals, and x ln y.
 
 use crate::cases::{INF, NAN};
+use crate::slopes::{any_powi_slope, base_slope, exponent_slope, powi_slope, product_over};
 use crate::{Cases, Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 
-/// y = 1 / x; dx = -g y^2.
+/// y = 1 / x; dx = -g / x^2.
 #[derive(Clone, Copy)]
 pub struct Reciprocal;
 impl Formula<1> for Reciprocal {
     const NAME: &'static str = "reciprocal";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let one = x.like(1.0);
         one / x
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
-        [-(g * (y * y))]
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
+        [powi_slope(g, x, -1)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).domain_also(-3.0..-0.5).at([0.0], INF, [-INF]).at([-INF], 0.0, [0.0]).at(
@@ -35,9 +37,15 @@ pub struct Powi {
 }
 impl Formula<1> for Powi {
     const NAME: &'static str = "powi";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.powi(self.exponent)
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
+        // Compared outside of the loop, since the exponent is none of its numbers.
+        [if self.exponent == 0 { g.like(0.0) } else { any_powi_slope(g, x, self.exponent) }]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0).domain_also(-2.0..-0.5);
@@ -57,6 +65,7 @@ impl Formula<1> for Powi {
 pub struct ConstPowi<const N: i32>;
 impl<const N: i32> Formula<1> for ConstPowi<N> {
     const NAME: &'static str = "powi";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         Powi { exponent: N }.f([x])
@@ -74,9 +83,14 @@ pub struct Powf {
 }
 impl Formula<1> for Powf {
     const NAME: &'static str = "powf";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         if self.exponent == 0.0 { x.like(1.0) } else { x.pow(x.like(self.exponent)) }
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], y: E) -> [E; 1] {
+        [if self.exponent == 0.0 { g.like(0.0) } else { base_slope(g, x, x.like(self.exponent), y) }]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0);
@@ -96,13 +110,14 @@ impl Formula<1> for Powf {
 pub struct Pow;
 impl Formula<2> for Pow {
     const NAME: &'static str = "pow";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a.pow(b)
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], y: E) -> [E; 2] {
-        [g * slope_of_base(a, b), g * slope_of_exponent(a, b, y)]
+        [base_slope(g, a, b, y), exponent_slope(g, a, b, y)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0).domain(-2.0..2.0);
@@ -112,30 +127,12 @@ impl Formula<2> for Pow {
     }
 }
 
-/// The derivative of y = a^b by a.
-#[inline(always)]
-pub(crate) fn slope_of_base<E: Real>(a: E, b: E) -> E {
-    let full = b * a.pow(b - b.like(1.0));
-    // 0 where both are 0, and NaN where one is.
-    let origin = (a + b) * b.like(0.0);
-    (a.abs() + b.abs()).if_positive(full, origin)
-}
-
-/// The derivative of y = a^b by b.
-#[inline(always)]
-pub(crate) fn slope_of_exponent<E: Real>(a: E, b: E, y: E) -> E {
-    let (zero, one, size) = (a.like(0.0), a.like(1.0), a.abs());
-    // A logarithm that is finite where it is not chosen, or the next derivative would be NaN.
-    let full = y * size.if_positive(a, one).ln();
-    let at_zero = (-b).if_positive(y * size.ln(), y * zero + a * zero);
-    size.if_positive(full, at_zero)
-}
-
 /// y = a ln b, 0 for a = 0 unless b is NaN. da = g ln b, but 0 where a = 0 and b <= 0. db = g a / b, but 0 where a = 0.
 #[derive(Clone, Copy)]
 pub struct Xlogy;
 impl Formula<2> for Xlogy {
     const NAME: &'static str = "xlogy";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         let ln = b.ln();
@@ -146,7 +143,7 @@ impl Formula<2> for Xlogy {
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
         // Where a is 0, the logarithm of 1 if b has none, and a division by 1: the next derivative is not NaN there.
         let divisor = a.abs().if_positive(b, b.like(1.0));
-        [g * b.if_positive(b, divisor).ln(), g * (a / divisor)]
+        [g * b.if_positive(b, divisor).ln(), product_over(g, a, divisor)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.5..3.0);

@@ -1,6 +1,7 @@
 //! Trigonometric and hyperbolic functions, and inverse ones.
 
 use crate::cases::{INF, PI};
+use crate::slopes::{atan_slope, complement, length_slope, turn};
 use crate::{Cases, Formula};
 use raygrad_tensor::Real;
 
@@ -54,6 +55,7 @@ impl Formula<1> for SinPi {
 pub struct CosPi;
 impl Formula<1> for CosPi {
     const NAME: &'static str = "cos_pi";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.cos_pi()
@@ -64,23 +66,18 @@ impl Formula<1> for CosPi {
     }
 }
 
-/// y = tanh x; dx = g (1 - y^2). Saturates: the gradient is 0 at +-inf.
+/// y = tanh x; dx = g / cosh^2 x. Saturates: the gradient is 0 at +-inf.
 #[derive(Clone, Copy)]
 pub struct Tanh;
 impl Formula<1> for Tanh {
     const NAME: &'static str = "tanh";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.tanh()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
-        let one = y.like(1.0);
-        // (1 - y)(1 + y) keeps digits where y is near +-1.
-        [g * ((one - y) * (one + y))]
-    }
     fn cases(&self, c: &mut Cases) {
-        c.domain(-3.0..3.0).at([INF], 1.0, [0.0]).at([-INF], -1.0, [0.0]).at([300.0], 1.0, [0.0]).at([0.0], 0.0, [1.0]);
+        c.domain(-3.0..3.0).at([INF], 1.0, [0.0]).at([-INF], -1.0, [0.0]).at([300.0], 1.0, [1.060158621202e-260]).at([0.0], 0.0, [1.0]);
     }
 }
 
@@ -152,8 +149,7 @@ impl Formula<1> for Atan {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
-        let one = x.like(1.0);
-        [g / (one + x * x)]
+        [atan_slope(g, x)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [1.0]).at([INF], 0.5 * PI, [0.0]).at([-INF], -0.5 * PI, [0.0]);
@@ -165,13 +161,14 @@ impl Formula<1> for Atan {
 pub struct Atan2;
 impl Formula<2> for Atan2 {
     const NAME: &'static str = "atan2";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a.atan2(b)
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
-        [g * turn(b, a, b), -(g * turn(a, a, b))]
+        [turn(g, b, a, b), -turn(g, a, a, b)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.3..3.0).domain_also(-3.0..-0.3).domain(-3.0..3.0);
@@ -184,24 +181,24 @@ impl Formula<2> for Atan2 {
     }
 }
 
-/// `sqrt(1 - x^2)`, as a product that keeps its digits near +-1.
-#[inline(always)]
-pub(crate) fn complement<E: Real>(x: E) -> E {
-    let one = x.like(1.0);
-    ((one - x) * (one + x)).sqrt()
-}
-
-/// `c / (a^2 + b^2)`, 0 at the origin. Scaled, so that no square overflows or underflows.
-#[inline(always)]
-pub(crate) fn turn<E: Real>(c: E, a: E, b: E) -> E {
-    let scale = a.abs().maximum(b.abs());
-    let one = a.like(1.0);
-    // At the origin c is 0, and so is the result.
-    let scale = scale.if_positive(scale, one);
-    let (a, b) = (a / scale, b / scale);
-    let square = a * a + b * b;
-    let square = square.if_positive(square, one);
-    c / scale / square / scale
+/// y = sqrt(a^2 + b^2); da = g a / y, db = g b / y. Both are 0 at the origin.
+#[derive(Clone, Copy)]
+pub struct Hypot;
+impl Formula<2> for Hypot {
+    const NAME: &'static str = "hypot";
+    const WIDE_GRADIENT: bool = true;
+    #[inline(always)]
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
+        a.hypot(b)
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], y: E) -> [E; 2] {
+        [length_slope(g, a, y), length_slope(g, b, y)]
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(0.3..3.0).domain_also(-3.0..-0.3).domain(-3.0..3.0);
+        c.at([0.0, 0.0], 0.0, [0.0, 0.0]).at([3e30, 4e30], 5e30, [0.6, 0.8]).at([-3e-30, 4e-30], 5e-30, [-0.6, 0.8]);
+    }
 }
 
 /// y = sinh x; dx = g cosh x.
@@ -209,6 +206,7 @@ pub(crate) fn turn<E: Real>(c: E, a: E, b: E) -> E {
 pub struct Sinh;
 impl Formula<1> for Sinh {
     const NAME: &'static str = "sinh";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.sinh()
@@ -223,6 +221,7 @@ impl Formula<1> for Sinh {
 pub struct Cosh;
 impl Formula<1> for Cosh {
     const NAME: &'static str = "cosh";
+    const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.cosh()
@@ -256,6 +255,12 @@ elementwise! {
     /// # Panics
     /// If the shapes do not broadcast.
     atan2(x) = Atan2;
+    /// The length of the vector (`self`, `other`): no square overflows or underflows. Shapes broadcast. Both gradients
+    /// are 0 at the origin.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    hypot(other) = Hypot;
     /// Hyperbolic sine, accurate near 0.
     sinh() = Sinh;
     /// Hyperbolic cosine.

@@ -85,6 +85,7 @@ def elementwise():
     unary("sqrt", torch.sqrt, (0.1, 4))
     unary("rsqrt", torch.rsqrt, (0.1, 4))
     unary("erf", torch.erf, (-2.5, 2.5))
+    unary("normal_cdf", torch.special.ndtr, (-2.5, 2.5))
     unary("sin", torch.sin, *wide)
     unary("cos", torch.cos, *wide)
     unary("tan", torch.tan, (-1.3, 1.3))
@@ -124,6 +125,9 @@ def elementwise():
     binary("atan2", torch.atan2, b=((-3, -0.5), (0.5, 3)))
     binary("pow", torch.pow, a=positive)
     binary("xlogy", torch.xlogy, b=positive)
+    binary("hypot", torch.hypot, b=((-3, -0.5), (0.5, 3)))
+    binary("logaddexp", torch.logaddexp)
+    binary("remainder", torch.remainder, a=((2.1, 2.4), (-2.4, -2.1)), b=((0.9, 1.0),))
     binary("maximum", torch.maximum, *apart)
     binary("minimum", torch.minimum, *apart)
     for name, f in dict(gt=torch.gt, ge=torch.ge, lt=torch.lt, le=torch.le, eq=torch.eq, ne=torch.ne).items():

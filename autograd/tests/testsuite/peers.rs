@@ -55,6 +55,9 @@ fn elementwise() -> Vec<Case> {
         "atan2": |x| x[0].atan2(&x[1]);
         "pow": |x| x[0].pow(&x[1]);
         "xlogy": |x| x[0].xlogy(&x[1]);
+        "hypot": |x| x[0].hypot(&x[1]);
+        "logaddexp": |x| x[0].logaddexp(&x[1]);
+        "remainder": |x| x[0].remainder(&x[1]);
         "maximum": |x| x[0].maximum(&x[1]);
         "minimum": |x| x[0].minimum(&x[1]);
         "add": |x| &x[0] + &x[1];

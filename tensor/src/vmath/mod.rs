@@ -27,6 +27,7 @@ pub mod f32;
 pub mod f64;
 mod plain;
 pub mod survey;
+pub(crate) mod wide;
 
 #[cfg(test)]
 mod tests;

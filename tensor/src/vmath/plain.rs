@@ -18,7 +18,9 @@ macro_rules! functions_of {
     ($t:ident) => {
         /// The functions in this precision.
         pub mod $t {
-            use crate::vmath::$t::{exp, expm1};
+            use crate::vmath::$t::expm1;
+            use crate::vmath::wide::$t::Wide;
+            use crate::Wide as _;
 
             from_std!($t: sqrt tan asin acos atan abs floor ceil);
 
@@ -40,24 +42,54 @@ macro_rules! functions_of {
                 $t::round_ties_even(x)
             }
 
-            /// Hyperbolic sine, within 4 ULP. It uses `expm1` near 0, and the square of `e^(x/2)` where `e^-x` does not
-            /// matter, so that it overflows only if the result does.
+            /// Hyperbolic sine, within 2 ULP. It uses `expm1` up to 2, and beyond half the difference of e^x and e^-x,
+            /// which overflows only if the result does.
             #[inline(always)]
             pub fn sinh(x: $t) -> $t {
                 let a = $t::abs(x);
                 let t = expm1(a);
-                let half = exp(0.5 * a);
-                let y = if a < 20.0 { 0.5 * (t + t / (t + 1.0)) } else { 0.5 * half * half };
+                let (e, inverse) = exponentials(a);
+                let y = if a < 2.0 { 0.5 * (t + t / (t + 1.0)) } else { e - inverse };
                 $t::copysign(y, x)
             }
 
-            /// Hyperbolic cosine, within 4 ULP; see [`sinh`].
+            /// Hyperbolic cosine, within 2 ULP; see [`sinh`].
             #[inline(always)]
             pub fn cosh(x: $t) -> $t {
-                let a = $t::abs(x);
-                let t = exp(a);
-                let half = exp(0.5 * a);
-                if a < 20.0 { 0.5 * (t + 1.0 / t) } else { 0.5 * half * half }
+                let (e, inverse) = exponentials($t::abs(x));
+                e + inverse
+            }
+
+            /// Halves of e^a and e^-a for a >= 0.
+            #[inline(always)]
+            fn exponentials(a: $t) -> ($t, $t) {
+                let e = Wide::exp(a, 0.0);
+                ((e * Wide::new(0.5)).narrow(), 0.5 / e.narrow())
+            }
+
+            /// The distribution function of the standard normal distribution, within 4 ULP.
+            #[inline(always)]
+            pub fn normal_cdf(x: $t) -> $t {
+                Wide::normal_cdf(x).narrow()
+            }
+
+            /// The length of the vector (`x`, `y`), within 2 ULP, from the ratio of the two.
+            #[inline(always)]
+            pub fn hypot(x: $t, y: $t) -> $t {
+                let (x, y) = ($t::abs(x), $t::abs(y));
+                let (long, short) = if x > y { (x, y) } else { (y, x) };
+                let ratio = short / if long > 0.0 { long } else { 1.0 };
+                let length = long * $t::sqrt(ratio.mul_add(ratio, 1.0));
+                let is_infinite = x == $t::INFINITY || y == $t::INFINITY;
+                if is_infinite { $t::INFINITY } else { length }
+            }
+
+            /// `x` modulo `y` as in Python: `x - y floor(x / y)`, rounded once. It has the sign of `y`.
+            #[inline(always)]
+            pub fn remainder(x: $t, y: $t) -> $t {
+                let rest = x % y;
+                let other_sign = rest != 0.0 && (rest < 0.0) != (y < 0.0);
+                if other_sign { rest + y } else { rest.copysign(if rest == 0.0 { y } else { rest }) }
             }
 
             /// 1 for positive numbers, -1 for negative ones. Zeros and NaN stay unchanged.

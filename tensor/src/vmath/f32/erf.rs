@@ -8,8 +8,6 @@ use super::{clamp, exp::exp_minus, polynomial};
 /// approximates the logarithm of the complement, error 2^-34 of the result.
 #[inline(always)]
 pub fn erf(x: f32) -> f32 {
-    const P: [f32; 7] =
-        [0.128_379_17, -0.376_126_32, 0.112_836_786, -0.026_858_734, 0.005_199_772, -0.000_813_124_7, 8.330_086e-5];
     const Q: [f32; 8] = [
         0.000_174_491_84,
         -1.129_514,
@@ -21,7 +19,14 @@ pub fn erf(x: f32) -> f32 {
         -2.108_466_1e-5,
     ];
     let a = clamp(x.abs(), 0.0, 4.0);
-    let near = x.mul_add(polynomial(a * a, P), x);
     let far = (1.0 - exp_minus(-polynomial(a, Q))).copysign(x);
-    if a < 0.92 { near } else { far }
+    if a < 0.92 { erf_near(x) } else { far }
+}
+
+/// The error function for |x| <= 0.92.
+#[inline(always)]
+pub(in crate::vmath) fn erf_near(x: f32) -> f32 {
+    const P: [f32; 7] =
+        [0.128_379_17, -0.376_126_32, 0.112_836_786, -0.026_858_734, 0.005_199_772, -0.000_813_124_7, 8.330_086e-5];
+    x.mul_add(polynomial(x * x, P), x)
 }

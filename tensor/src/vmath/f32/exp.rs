@@ -22,7 +22,7 @@ fn reduce(x: f32) -> (f32, i32) {
 
 /// `e^r - 1` for `r = x - n ln 2`.
 #[inline(always)]
-fn expm1_of_rest(x: f32, n: f32) -> f32 {
+pub(in crate::vmath) fn expm1_of_rest(x: f32, n: f32) -> f32 {
     let high = n.mul_add(-LN_2_HIGH, x); // exact
     let r = n.mul_add(-LN_2_LOW, high);
     let r_low = n.mul_add(-LN_2_LOW, high - r);

@@ -8,6 +8,8 @@ mod trig;
 
 pub use super::plain::f32::*;
 pub use erf::erf;
+pub(in crate::vmath) use erf::erf_near;
+pub(in crate::vmath) use exp::expm1_of_rest;
 pub use exp::{exp, exp2, expm1, sigmoid, tanh};
 pub use log::{ln, ln1p, log2, softplus};
 pub(crate) use trig::QUICK;
@@ -15,11 +17,11 @@ pub use trig::{cos, cos_pi, cos_quick, sin, sin_pi, sin_quick};
 
 /// Adding and subtracting this number rounds to the nearest integer (ties to even) for |x| < 2^22, because an ULP is 1
 /// there. After the addition, the low bits of the sum hold that integer.
-const ROUND: f32 = 12_582_912.0; // 1.5 * 2^23
+pub(in crate::vmath) const ROUND: f32 = 12_582_912.0; // 1.5 * 2^23
 
 /// The nearest integer to `a * b`, |a b| < 2^22, as a number and as an integer. Meaningless, but harmless, on NaN.
 #[inline(always)]
-fn round_product(a: f32, b: f32) -> (f32, i32) {
+pub(in crate::vmath) fn round_product(a: f32, b: f32) -> (f32, i32) {
     let t = a.mul_add(b, ROUND);
     (t - ROUND, (t.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32))
 }
@@ -32,7 +34,7 @@ fn power_of_two(n: i32) -> f32 {
 
 /// `x` limited to `lo..=hi`, but NaN stays NaN (`f32::max` would drop it). Two instructions.
 #[inline(always)]
-fn clamp(x: f32, lo: f32, hi: f32) -> f32 {
+pub(in crate::vmath) fn clamp(x: f32, lo: f32, hi: f32) -> f32 {
     let x = if x < lo { lo } else { x };
     if x > hi { hi } else { x }
 }
@@ -40,7 +42,7 @@ fn clamp(x: f32, lo: f32, hi: f32) -> f32 {
 /// The polynomial `c[0] + c[1] x + c[2] x^2 + ...`. Horner's rule runs for even and odd powers side by side, since a
 /// single chain has a longer latency.
 #[inline(always)]
-fn polynomial<const N: usize>(x: f32, c: [f32; N]) -> f32 {
+pub(in crate::vmath) fn polynomial<const N: usize>(x: f32, c: [f32; N]) -> f32 {
     let x2 = x * x;
     let (mut last, mut other) = (c[N - 1], c[N - 2]);
     for i in (0..N - 2).rev() {

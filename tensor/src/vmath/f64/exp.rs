@@ -39,7 +39,7 @@ fn exp_of_rest(x: f64, n: f64) -> f64 {
 
 /// `e^r - 1` for `r = x - n ln 2`.
 #[inline(always)]
-fn expm1_of_rest(x: f64, n: f64) -> f64 {
+pub(in crate::vmath) fn expm1_of_rest(x: f64, n: f64) -> f64 {
     let high = n.mul_add(-LN_2_HIGH, x); // exact
     let r = n.mul_add(-LN_2_LOW, high);
     expm1_near(r, n.mul_add(-LN_2_LOW, high - r))

@@ -8,6 +8,8 @@ mod trig;
 
 pub use super::plain::f64::*;
 pub use erf::erf;
+pub(in crate::vmath) use erf::erf_near;
+pub(in crate::vmath) use exp::expm1_of_rest;
 pub use exp::{exp, exp2, expm1, sigmoid, tanh};
 pub use log::{ln, ln1p, log2, softplus};
 pub(crate) use trig::QUICK;
@@ -15,11 +17,11 @@ pub use trig::{cos, cos_pi, cos_quick, sin, sin_pi, sin_quick};
 
 /// Adding and subtracting this number rounds to the nearest integer (ties to even) for |x| < 2^51, because an ULP is 1
 /// there. After the addition, the low bits of the sum hold that integer.
-const ROUND: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52
+pub(in crate::vmath) const ROUND: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52
 
 /// The nearest integer to `a * b`, as a number and, if it is below 2^31, as an integer.
 #[inline(always)]
-fn round_product(a: f64, b: f64) -> (f64, i32) {
+pub(in crate::vmath) fn round_product(a: f64, b: f64) -> (f64, i32) {
     let t = a.mul_add(b, ROUND);
     (t - ROUND, t.to_bits() as i32) // ROUND has no low bits
 }
@@ -32,7 +34,7 @@ fn power_of_two(n: i32) -> f64 {
 
 /// `x` limited to `lo..=hi`, but NaN stays NaN (`f64::max` would drop it). Two instructions.
 #[inline(always)]
-fn clamp(x: f64, lo: f64, hi: f64) -> f64 {
+pub(in crate::vmath) fn clamp(x: f64, lo: f64, hi: f64) -> f64 {
     let x = if x < lo { lo } else { x };
     if x > hi { hi } else { x }
 }
@@ -40,7 +42,7 @@ fn clamp(x: f64, lo: f64, hi: f64) -> f64 {
 /// The polynomial `c[0] + c[1] x + c[2] x^2 + ...`. Horner's rule runs for even and odd powers side by side, since a
 /// single chain has a longer latency.
 #[inline(always)]
-fn polynomial<const N: usize>(x: f64, c: [f64; N]) -> f64 {
+pub(in crate::vmath) fn polynomial<const N: usize>(x: f64, c: [f64; N]) -> f64 {
     let x2 = x * x;
     let (mut last, mut other) = (c[N - 1], c[N - 2]);
     for i in (0..N - 2).rev() {

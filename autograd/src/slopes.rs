@@ -1,0 +1,280 @@
+//! Derivatives of the elementary functions: each takes the slope `s` of the argument and returns that of the result.
+//!
+//! A slope is an incoming gradient times a derivative. It may be an ordinary number where the derivative alone, or a
+//! product on the way to it, is out of range: so such products are [`Wide`].
+
+use raygrad_tensor::{Real, Wide};
+use std::f64::consts::{LN_2, PI};
+
+/// `x`, but at least `low`; NaN stays NaN.
+#[inline(always)]
+pub(crate) fn at_least<E: Real>(x: E, low: f64) -> E {
+    let low = x.like(low);
+    (low - x).if_positive(low, x)
+}
+
+/// `x`, but at most `high`; NaN stays NaN.
+#[inline(always)]
+pub(crate) fn at_most<E: Real>(x: E, high: f64) -> E {
+    let high = x.like(high);
+    (x - high).if_positive(high, x)
+}
+
+/// `s e^x`, for y = e^x.
+#[inline(always)]
+pub(crate) fn exp_slope<E: Real>(s: E, x: E, y: E) -> E {
+    E::checked(s * y, [], [y], || (s.wide() * E::Wide::exp(x, x.like(0.0))).narrow())
+}
+
+/// `s e^(c x^2)`, for a power of two `c`. The rounding error of the square counts as many times as the square is large.
+#[inline(always)]
+pub(crate) fn bell<E: Real>(s: E, x: E, c: f64) -> E {
+    let [square, low] = scaled_square(x, c);
+    let y = square.exp();
+    E::checked(s * y.mul_add(low, y), [], [y], || (s.wide() * wide_bell(x, c)).narrow())
+}
+
+/// `e^(c x^2)`, for a power of two `c`.
+#[inline(always)]
+pub(crate) fn wide_bell<E: Real>(x: E, c: f64) -> E::Wide {
+    let [square, low] = scaled_square(x, c);
+    E::Wide::exp(square, low)
+}
+
+/// `c x^2` and its rounding error, for a power of two `c`.
+#[inline(always)]
+fn scaled_square<E: Real>(x: E, c: f64) -> [E; 2] {
+    let scaled = x.like(c) * x;
+    let square = scaled * x;
+    // Where the square overflows, there is none.
+    let (one, low) = (x.like(1.0), scaled.mul_add(x, -square));
+    [square, (one - low.abs()).if_positive(low, x.like(0.0))]
+}
+
+/// `s 2^x ln 2`, for y = 2^x; from twice the rounded half of x and the rest.
+#[inline(always)]
+pub(crate) fn exp2_slope<E: Real>(s: E, x: E, y: E) -> E {
+    let ln_2 = x.like(LN_2);
+    E::checked(s * (y * ln_2), [], [y], || {
+        let x = at_most(at_least(x, -4e3), 4e3);
+        let half = (x.like(0.5) * x).round();
+        let (root, rest) = (half.exp2().wide(), (x - half - half).exp2().wide());
+        (s.wide() * ln_2.wide() * root * root * rest).narrow()
+    })
+}
+
+/// 1 / (1 + e^-x).
+#[inline(always)]
+pub(crate) fn wide_sigmoid<E: Real>(x: E) -> E::Wide {
+    E::Wide::sigmoid(x, x.like(0.0))
+}
+
+/// `s / (1 + e^-(x + low))` for a rounding error `low` of x.
+#[inline(always)]
+pub(crate) fn corrected_sigmoid<E: Real>(s: E, x: E, low: E) -> E {
+    let share = near_sigmoid(x, low);
+    E::checked(s * share, [], [share], || (s.wide() * E::Wide::sigmoid(x, low)).narrow())
+}
+
+/// `1 / (1 + e^-(x + low))` for a rounding error `low` of x.
+#[inline(always)]
+pub(crate) fn near_sigmoid<E: Real>(x: E, low: E) -> E {
+    let share = x.sigmoid();
+    share.mul_add((share.like(1.0) - share) * low, share)
+}
+
+/// The derivative of the sigmoid by one exponential and one division. It has no derivative of its own at 0.
+#[inline(always)]
+fn logistic_density<E: Real>(x: E) -> E {
+    let (one, e) = (x.like(1.0), (-x.abs()).exp());
+    let share = one / (one + e);
+    e * (share * share)
+}
+
+/// The derivative of the sigmoid, as a product that keeps its digits where the sigmoid is near 1.
+#[inline(always)]
+pub(crate) fn sigmoid_slope<E: Real>(s: E, x: E) -> E {
+    let slope = logistic_density(x);
+    E::checked(s * slope, [], [slope], || (s.wide() * wide_sigmoid(x) * wide_sigmoid(-x)).narrow())
+}
+
+/// The derivative of softplus is the sigmoid.
+#[inline(always)]
+pub(crate) fn softplus_slope<E: Real>(s: E, x: E) -> E {
+    let slope = x.sigmoid();
+    E::checked(s * slope, [], [slope], || (s.wide() * wide_sigmoid(x)).narrow())
+}
+
+/// `1 - tanh^2 x` is four times the derivative of the sigmoid at 2x.
+#[inline(always)]
+pub(crate) fn tanh_slope<E: Real>(s: E, x: E) -> E {
+    let (twice, four) = (x + x, x.like(4.0));
+    let slope = four * logistic_density(twice);
+    let exact = || (s.wide() * four.wide() * wide_sigmoid(twice) * wide_sigmoid(-twice)).narrow();
+    E::checked(s * slope, [], [slope], exact)
+}
+
+/// `s cosh x`, as `s e^x / 2 + s e^-x / 2`.
+#[inline(always)]
+pub(crate) fn sinh_slope<E: Real>(s: E, x: E) -> E {
+    let slope = x.cosh();
+    E::checked(s * slope, [], [slope], || half_exp(s, x) + half_exp(s, -x))
+}
+
+/// `s sinh x`, as a difference where it does not cancel.
+#[inline(always)]
+pub(crate) fn cosh_slope<E: Real>(s: E, x: E) -> E {
+    let slope = x.sinh();
+    E::checked(s * slope, [slope], [], || {
+        let is_near = x.like(1.0) - x.abs();
+        is_near.if_positive(s * slope, half_exp(s, x) - half_exp(s, -x))
+    })
+}
+
+#[inline(always)]
+fn half_exp<E: Real>(s: E, x: E) -> E {
+    (s.wide() * x.like(0.5).wide() * E::Wide::exp(x, x.like(0.0))).narrow()
+}
+
+/// `-s pi sin(pi x)`. A sine that is a subnormal number has lost digits, so close to 0 it is `pi x`.
+#[inline(always)]
+pub(crate) fn cos_pi_slope<E: Real>(s: E, x: E) -> E {
+    let (one, pi, sine) = (x.like(1.0), x.like(PI), x.sin_pi());
+    let exact = || {
+        let is_far = x.abs() - x.like(1e-9);
+        let (sine, factor) = (is_far.if_positive(sine, x), is_far.if_positive(one, pi));
+        -(s.wide() * pi.wide() * factor.wide() * sine.wide()).narrow()
+    };
+    E::checked(-(s * (pi * sine)), [x], [], exact)
+}
+
+/// The derivative of the square root y.
+#[inline(always)]
+pub(crate) fn sqrt_slope<E: Real>(s: E, y: E) -> E {
+    s / (y + y)
+}
+
+/// `sqrt(1 - x^2)`, as a product that keeps its digits near +-1.
+#[inline(always)]
+pub(crate) fn complement<E: Real>(x: E) -> E {
+    let one = x.like(1.0);
+    ((one - x) * (one + x)).sqrt()
+}
+
+/// `s / (1 + x^2)`, without the 1 and the square where the square could overflow.
+#[inline(always)]
+pub(crate) fn atan_slope<E: Real>(s: E, x: E) -> E {
+    let (one, is_far) = (x.like(1.0), x.abs() - x.like(1e9));
+    // Two divisions for both, since a choice of results is a branch, which prevents vectorisation.
+    let (near, far) = (is_far.if_positive(one, x), is_far.if_positive(x, one));
+    s / far / is_far.if_positive(far, one + near * near)
+}
+
+/// `s c / (a^2 + b^2)` for c = a or b; 0 at the origin.
+#[inline(always)]
+pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
+    let (one, scale) = (a.like(1.0), a.abs().maximum(b.abs()));
+    // At the origin c is 0, and so is the result.
+    let scale = scale.if_positive(scale, one);
+    let (a, b) = (a / scale, b / scale);
+    let square = a * a + b * b;
+    let square = square.if_positive(square, one);
+    let exact = || (s.wide() * c.wide() / (scale.wide() * scale.wide() * square.wide())).narrow();
+    E::checked(s / scale / square * (c / scale), [s, c, scale], [], exact)
+}
+
+/// The derivative `a / y` of the length y of a vector by its component a; 0 at the origin.
+#[inline(always)]
+pub(crate) fn length_slope<E: Real>(s: E, a: E, y: E) -> E {
+    product_over(s, a, y.if_positive(y, y.like(1.0)))
+}
+
+/// `s a / b`.
+#[inline(always)]
+pub(crate) fn product_over<E: Real>(s: E, a: E, b: E) -> E {
+    E::checked(s * a / b, [s, a, b], [], || (s.wide() * a.wide() / b.wide()).narrow())
+}
+
+/// `s a / b^2`.
+#[inline(always)]
+pub(crate) fn over_square<E: Real>(s: E, a: E, b: E) -> E {
+    E::checked(s / b * (a / b), [s, a, b], [], || (s.wide() * a.wide() / (b.wide() * b.wide())).narrow())
+}
+
+/// `s floor(a / b)`, from the remainder y.
+#[inline(always)]
+pub(crate) fn multiple<E: Real>(s: E, a: E, b: E, y: E) -> E {
+    E::checked(s * ((a - y) / b).round(), [s, a, b], [], || {
+        let [difference, scale] = scaled_difference(a, y);
+        let quotient = difference.wide() / (b.wide() * scale.wide());
+        // A rounded quotient is constant also for further derivatives; a large one is too large for rounding.
+        let rounded = quotient.narrow().round();
+        let is_small = s.like(1e4) - rounded.abs();
+        is_small.if_positive((s.wide() * rounded.wide()).narrow(), (s.wide() * quotient).narrow())
+    })
+}
+
+/// `(a - b) c` without overflow, and c, which is 1/2; or 1 for small numbers, of which the halves are not exact.
+#[inline(always)]
+pub(crate) fn scaled_difference<E: Real>(a: E, b: E) -> [E; 2] {
+    let (one, half, is_large) = (a.like(1.0), a.like(0.5), a.abs() + b.abs() - a.like(1.0));
+    let scale = is_large.if_positive(half, one);
+    [a * scale - b * scale, scale]
+}
+
+/// `s n x^(n - 1)` for a whole n that is not 0.
+#[inline(always)]
+pub(crate) fn powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
+    let factor = x.like(f64::from(n));
+    match n {
+        1 => s,
+        2 => s * x * factor,
+        3 => E::checked(s * x * x * factor, [s, x], [], || (s.wide() * factor.wide() * x.wide() * x.wide()).narrow()),
+        4 => {
+            let exact = || (s.wide() * factor.wide() * x.wide() * x.wide() * x.wide()).narrow();
+            E::checked(s * x * x * x * factor, [s, x], [], exact)
+        }
+        -1 => -E::checked(s / x / x, [s, x], [], || (s.wide() / (x.wide() * x.wide())).narrow()),
+        _ => any_powi_slope(s, x, n),
+    }
+}
+
+/// [`powi_slope`] in one form for all exponents.
+#[inline(always)]
+pub(crate) fn any_powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
+    let (factor, power) = (x.like(f64::from(n)), x.powi(n.saturating_sub(1)));
+    let exact = || (s.wide() * factor.wide() * E::Wide::powi(x, n.saturating_sub(1))).narrow();
+    E::checked(s * (factor * power), [], [power], exact)
+}
+
+/// The derivative of y = a^b by a.
+#[inline(always)]
+pub(crate) fn base_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
+    let (zero, one) = (a.like(0.0), a.like(1.0));
+    // Positive unless a is 0, infinite or NaN.
+    let is_ordinary = a.abs() * (one / a.abs());
+    let base = is_ordinary.if_positive(a, one);
+    // Where b - 1 is exact, its power; elsewhere its rounding error would count as many times as the logarithm is large.
+    let less = a.pow(b - one);
+    let is_exact = (b - one) * (b.like(1e6) - b);
+    let power = is_exact.if_positive(less, y / base);
+    let exact = || {
+        let y = is_ordinary.if_positive(y, one);
+        (s.wide() * b.wide() * E::Wide::pow(base, b, y) / base.wide()).narrow()
+    };
+    let full = E::checked(s * (b * power), [b], [power], exact);
+    // At an infinite or a zero base; 0 where both are 0, and NaN where one is.
+    let limit = (a.abs() + b.abs()).if_positive(s * (b * less), (a + b) * zero);
+    is_ordinary.if_positive(full, limit)
+}
+
+/// The derivative of y = a^b by b.
+#[inline(always)]
+pub(crate) fn exponent_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
+    let (zero, one, size) = (a.like(0.0), a.like(1.0), a.abs());
+    // A logarithm that is finite where it is not chosen, or the next derivative would be NaN.
+    let ln = size.if_positive(a, one).ln();
+    let full = E::checked(s * (y * ln), [], [y], || (s.wide() * E::Wide::pow(a, b, y) * ln.wide()).narrow());
+    let at_zero = s * (-b).if_positive(y * size.ln(), y * zero + a * zero);
+    size.if_positive(full, at_zero)
+}
