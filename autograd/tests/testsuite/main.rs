@@ -1,5 +1,6 @@
 //! What this crate promises from outside.
 
+mod accuracy;
 mod catalogue;
 mod formula;
 mod harness;
