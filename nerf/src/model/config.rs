@@ -354,8 +354,8 @@ impl Config {
             checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))
         };
         check_schedule("schedule", Some(self.schedule))?;
-        named("adam", self.adam.check())?;
-        named("table_adam", self.table_adam.check())?;
+        named("adam", self.adam.check::<f32>())?;
+        named("table_adam", self.table_adam.check::<f32>())?;
         check_schedule(POSES, self.poses)?;
         self.camera_optimizer.check()?;
         self.exposure_model.check()?;
@@ -363,7 +363,7 @@ impl Config {
         for group in &self.groups {
             let part = format!("groups.{}", group.params);
             named(&part, group.schedule.check())?;
-            named(&part, group.adam.check())?;
+            named(&part, group.adam.check::<f32>())?;
             let decay = group.weight_decay;
             if !(0.0..=1e30).contains(&decay) {
                 return Err(Error::setting("groups.weight_decay", format!("is {decay:?}; use 0 to 1e30")));

@@ -1,9 +1,9 @@
 //! Adam and AdamW.
 
-use super::limits::{flushed, limited, tiny, tiny_square};
+use super::limits::{flushed, limited, loaded_moment, moment_root, saved_moment, smallest_eps, tiny_square};
 use super::memory::Memory;
 use super::rule::Rule;
-use super::settings::{check, check_rate, check_share, or_panic};
+use super::settings::{check, check_decay, check_rate, or_panic};
 use super::{Optimizer, OptimizerState, SettingError, StateError, UpdateReport};
 use crate::Params;
 use raygrad_autograd::Gradient;
@@ -14,8 +14,8 @@ use serde::{Deserialize, Serialize};
 /// constants, learning rate and decoupled weight decay. [`AdamW`] makes an optimizer with decay.
 ///
 /// Bias corrections are computed in f64 from an integer step count, which each parameter has separately. First moments
-/// below 1e-30 (1e-300 in f64) and second moments below 1e-37 (1e-307) are set to 0. So long runs without gradient do
-/// not fill memory with denormal numbers, which are slow. Gradients count as at most 1e19 (1e154 in f64), so that their
+/// below 1e-30 (1e-300 in f64) and second moments below 4.7e-41 (1e-307) are set to 0. So long runs without gradient do
+/// not fill memory with denormal numbers, which are slow. Gradients count as at most 1.1e18 (1e154 in f64), so that their
 /// squares are finite. Work runs on the current rayon pool; the result does not depend on the number of threads.
 ///
 /// For a lazy parameter ([`Params::set_lazy`], PyTorch's `SparseAdam`), rows without gradient are not read. Each row
@@ -35,7 +35,7 @@ pub struct Adam<T: Scalar> {
 }
 
 /// Makes an [`Adam`] with decoupled weight decay (Loshchilov and Hutter 2019, algorithm 2). Before each step a
-/// parameter is multiplied by `1 - rate decay`. There is no decay of an element whose gradient is infinite or NaN, or
+/// parameter is multiplied by `1 - rate decay`, even where that rounds to 1 in the parameter's type. There is no decay of an element whose gradient is infinite or NaN, or
 /// of a row without gradient of a lazy parameter.
 #[derive(Debug, Clone, Copy)]
 pub struct AdamW;
@@ -43,12 +43,13 @@ pub struct AdamW;
 /// The constants of [`Adam`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AdamConfig {
-    /// Decay of the first moment. Range: at least 0 and less than 1.
+    /// Decay of the first moment. Range: 0 to 1 - 2^-20 (1 - 2^-49 in f64).
     pub beta1: f64,
-    /// Decay of the second moment. Range: at least 0 and less than 1.
+    /// Decay of the second moment. Range: 0 to 1 - 2^-20 (1 - 2^-49 in f64).
     pub beta2: f64,
     /// Added to the root of the second moment. It bounds the step of elements with tiny gradients: 1e-8 suits dense
-    /// networks, 1e-15 hash tables. Range: 1e-30 to 1e30.
+    /// networks, 1e-15 hash tables. In f32, a `beta2` above 0.9999 takes at least 1e-10. Range: 1e-15 to 1e30 (1e-30 to
+    /// 1e30 in f64).
     #[serde(alias = "epsilon")]
     pub eps: f64,
 }
@@ -61,14 +62,15 @@ impl Default for AdamConfig {
 }
 
 impl AdamConfig {
-    /// Checks that the constants are in their ranges.
+    /// Checks that the constants are in their ranges for parameters of type `T`.
     ///
     /// # Errors
     /// If one is not. The error has its name.
-    pub fn check(&self) -> Result<(), SettingError> {
-        check_share("beta1", self.beta1)?;
-        check_share("beta2", self.beta2)?;
-        check("eps", self.eps, (1e-30..=1e30).contains(&self.eps), "1e-30 to 1e30")
+    pub fn check<T: Scalar>(&self) -> Result<(), SettingError> {
+        check_decay::<T>("beta1", self.beta1)?;
+        check_decay::<T>("beta2", self.beta2)?;
+        let least = smallest_eps::<T>(self.beta2);
+        check("eps", self.eps, (least..=1e30).contains(&self.eps), &format!("{least:e} to 1e30"))
     }
 }
 
@@ -99,7 +101,7 @@ impl<T: Scalar> Group<T> {
 
     #[track_caller]
     fn new(config: AdamConfig, decay: f64) -> Self {
-        or_panic(config.check().and(check_rate("decay", decay)));
+        or_panic(config.check::<T>().and(check_rate("decay", decay)));
         Group { config, decay, corrections: vec![] }
     }
 
@@ -119,16 +121,14 @@ impl<T: Scalar> Group<T> {
         }
     }
 
-    /// A step at this learning rate, for a parameter with this factor of the decay, without bias correction.
-    fn update(&self, rate: f64, decay: f64) -> Update<T> {
-        let (AdamConfig { beta1, beta2, eps: epsilon }, decay) = (self.config, self.decay * decay);
+    /// A step at this learning rate, without bias correction.
+    fn update(&self, rate: f64) -> Update<T> {
+        let (AdamConfig { beta1, beta2, eps: epsilon }, scale) = (self.config, moment_root::<T>());
         Update {
             beta: [beta1, beta2].map(T::from_f64),
-            rest: [1.0 - beta1, 1.0 - beta2].map(T::from_f64),
-            rate: T::from_f64(rate),
-            epsilon: T::from_f64(epsilon),
-            keep: T::from_f64(1.0 - rate * decay),
-            tiniest: if decay == 0.0 { T::ZERO } else { tiny() },
+            rest: [1.0 - beta1, (1.0 - beta2) * scale * scale].map(T::from_f64),
+            rate: T::from_f64(rate * scale),
+            epsilon: T::from_f64(epsilon * scale),
         }
     }
 }
@@ -212,10 +212,10 @@ impl<T: Scalar> Adam<T> {
                 group.correct_rows();
             }
             let (group, rate) = (&*group, part.lr);
-            let update = group.update(rate, part.weight_decay);
+            let (update, decay) = (group.update(rate), group.decay * part.weight_decay);
             let whole = |step| {
                 let [first, second] = biases(group.config, step);
-                let root = second.sqrt();
+                let root = second.sqrt() * moment_root::<T>();
                 let rate = T::from_f64(rate * root / first);
                 Update { rate, epsilon: T::from_f64(group.config.eps * root), ..update }
             };
@@ -223,7 +223,12 @@ impl<T: Scalar> Adam<T> {
                 let [rate, epsilon] = group.correction(step);
                 Update { rate: update.rate * rate, epsilon: update.epsilon * epsilon, ..update }
             };
-            self.memory.update(part, whole, row, &mut report);
+            if decay == 0.0 {
+                self.memory.update(part, whole, row, &mut report);
+            } else {
+                let decayed = |update| Decayed::new(update, rate * decay);
+                self.memory.update(part, |step| decayed(whole(step)), |step| decayed(row(step)), &mut report);
+            }
         }
         report
     }
@@ -237,15 +242,24 @@ impl<T: Scalar> Optimizer<T> for Adam<T> {
 
     fn state(&self, params: &Params<T>) -> OptimizerState<T> {
         let mut state = self.memory.state(params);
+        second_moments(&mut state, saved_moment);
         state.put_counts("", "steps", vec![self.steps]);
         state
     }
 
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
         let mut state = state.clone();
+        second_moments(&mut state, loaded_moment);
         let (steps, memory) = (state.take_steps()?, self.memory.loaded(params, state)?);
         (self.steps, self.memory) = (steps, memory);
         Ok(())
+    }
+}
+
+/// Maps the second moments of a state.
+fn second_moments<T: Scalar>(state: &mut OptimizerState<T>, map: impl Fn(T) -> T) {
+    for (_, moments) in state.tensors.iter_mut().filter(|(name, _)| name.ends_with(".second")) {
+        moments.as_mut_slice().iter_mut().for_each(|moment| *moment = map(*moment));
     }
 }
 
@@ -264,29 +278,55 @@ impl AdamW {
     }
 }
 
-/// The constants of one step.
+/// The constants of one step. Those of the denominator and of the second moment have the factor of [`moment_root`].
 #[derive(Clone, Copy)]
 struct Update<T> {
     beta: [T; 2],
     rest: [T; 2],
     rate: T,
     epsilon: T,
-    /// Factor of weight decay.
-    keep: T,
-    /// Decaying parameters smaller than this become 0.
-    tiniest: T,
 }
 
-impl<T: Scalar> Rule<T, 2> for Update<T> {
+impl<T: Scalar> Update<T> {
+    /// The step of an element, and its new moments.
     #[inline(always)]
-    fn element(&self, x: T, grad: T, [first, second]: [T; 2]) -> (T, [T; 2]) {
+    fn step(&self, grad: T, [first, second]: [T; 2]) -> (T, [T; 2]) {
         let g = limited(grad);
         let first = flushed(self.beta[0] * first + self.rest[0] * g);
         let second = self.beta[1] * second + self.rest[1] * (g * g);
         let second = if second > tiny_square() { second } else { T::ZERO };
-        let kept = x * self.keep;
-        let kept = if kept < self.tiniest && kept > -self.tiniest { T::ZERO } else { kept };
-        (kept - self.rate * first / (second.sqrt() + self.epsilon), [first, second])
+        (self.rate * first / (second.sqrt() + self.epsilon), [first, second])
+    }
+}
+
+impl<T: Scalar> Rule<T, 2> for Update<T> {
+    #[inline(always)]
+    fn element(&self, x: T, grad: T, moments: [T; 2]) -> (T, [T; 2]) {
+        let (step, moments) = self.step(grad, moments);
+        (x - step, moments)
+    }
+}
+
+/// A step with weight decay. Decaying parameters become 0 where state does.
+#[derive(Clone, Copy)]
+struct Decayed<T> {
+    update: Update<T>,
+    /// The factor of the parameter, and its rounding error: without it, a decay below the rounding of 1 would be none.
+    keep: [T; 2],
+}
+
+impl<T: Scalar> Decayed<T> {
+    fn new(update: Update<T>, share: f64) -> Self {
+        let keep = T::from_f64(1.0 - share);
+        Decayed { update, keep: [keep, T::from_f64(1.0 - keep.to_f64() - share)] }
+    }
+}
+
+impl<T: Scalar> Rule<T, 2> for Decayed<T> {
+    #[inline(always)]
+    fn element(&self, x: T, grad: T, moments: [T; 2]) -> (T, [T; 2]) {
+        let (step, moments) = self.update.step(grad, moments);
+        (flushed(x * self.keep[0]) - (step - x * self.keep[1]), moments)
     }
 }
 

@@ -3,7 +3,7 @@
 use super::limits::{flushed, tiny};
 use super::memory::Memory;
 use super::rule::Rule;
-use super::settings::{check, check_rate, check_share, or_panic};
+use super::settings::{check, check_decay, check_rate, or_panic};
 use super::{Optimizer, OptimizerState, SettingError, StateError, UpdateReport};
 use crate::Params;
 use raygrad_autograd::Gradient;
@@ -26,8 +26,8 @@ pub struct Sgd<T: Scalar> {
 /// The constants of [`Sgd`].
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct SgdConfig {
-    /// Fraction of the last step's velocity that stays, at least 0 and less than 1. 0 is plain gradient descent,
-    /// without state.
+    /// Fraction of the last step's velocity that stays. Range: 0 to 1 - 2^-20 (1 - 2^-49 in f64). 0 is plain gradient
+    /// descent, without state.
     pub momentum: f64,
     /// Whether to use Nesterov momentum.
     pub nesterov: bool,
@@ -36,12 +36,12 @@ pub struct SgdConfig {
 }
 
 impl SgdConfig {
-    /// Checks that the constants are in their ranges.
+    /// Checks that the constants are in their ranges for parameters of type `T`.
     ///
     /// # Errors
     /// If one is not; the error has its name. Also if Nesterov momentum is on and `momentum` is 0.
-    pub fn check(&self) -> Result<(), SettingError> {
-        check_share("momentum", self.momentum)?;
+    pub fn check<T: Scalar>(&self) -> Result<(), SettingError> {
+        check_decay::<T>("momentum", self.momentum)?;
         check("momentum", self.momentum, !self.nesterov || self.momentum > 0.0, "more than 0 to look ahead")?;
         check_rate("decay", self.weight_decay)
     }
@@ -54,7 +54,7 @@ impl<T: Scalar> Sgd<T> {
     /// If [`SgdConfig::check`] fails.
     #[track_caller]
     pub fn new(config: SgdConfig) -> Self {
-        or_panic(config.check());
+        or_panic(config.check::<T>());
         Sgd { config, memory: Memory::new(if config.momentum == 0.0 { &[] } else { &["velocity"] }, false) }
     }
 }

@@ -337,7 +337,7 @@ fn optimizer_settings_are_checked() {
     assert_eq!(message(&config), "`schedule.constant.lr`: is 1e300; use 0 to 1e30");
     config.schedule = Schedule::Constant { lr: 0.1 };
     config.adam.beta1 = 1.0;
-    assert_eq!(message(&config), "`adam.beta1`: is 1.0; use at least 0 and less than 1");
+    assert_eq!(message(&config), "`adam.beta1`: is 1.0; use 0 to 1 - 2^-20");
     config.adam.beta1 = 0.0;
     config.table_adam.beta2 = 2.0;
     assert!(message(&config).contains("`table_adam.beta2`: is 2.0"));
