@@ -1,6 +1,7 @@
 //! Gradient clipping.
 
-use super::limits::flushed;
+use super::limits::{by_type, flushed};
+use super::memory::CHUNK;
 use raygrad_autograd::{Gradient, RowGrad, RowSums};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, simd};
 use std::sync::Arc;
@@ -23,10 +24,10 @@ pub struct Clipped {
 /// the direction of an overflow would be a guess. Sparse contributions are summed first, as for [`clip_norm`].
 ///
 /// # Panics
-/// If `bound` is negative or NaN.
+/// If `bound` is neither 0 nor at least 1e-30 (1e-300 in f64).
 #[track_caller]
 pub fn clip_value<T: Scalar>(grads: &mut [Gradient<T>], bound: f64) -> usize {
-    assert!(bound >= 0.0, "gradients cannot be limited to {bound}");
+    check_bound::<T>("gradients", bound);
     with_values(grads, |values| limit_values(values, T::from_f64(bound)))
 }
 
@@ -60,11 +61,17 @@ pub fn global_norm<T: Scalar>(grads: &[Gradient<T>]) -> (f64, usize) {
 /// ```
 ///
 /// # Panics
-/// If `bound` is negative or NaN.
+/// If `bound` is neither 0 nor at least 1e-30 (1e-300 in f64).
 #[track_caller]
 pub fn clip_norm<T: Scalar>(grads: &mut [Gradient<T>], bound: f64) -> Clipped {
-    assert!(bound >= 0.0, "a norm cannot be limited to {bound}");
+    check_bound::<T>("a norm", bound);
     with_values(grads, |values| limit_norm(values, bound))
+}
+
+#[track_caller]
+fn check_bound<T: Scalar>(what: &str, bound: f64) {
+    let least = by_type::<T>(1e-30, 1e-300);
+    assert!(bound == 0.0 || bound >= least, "{what} limited to {bound:e}; use 0, or at least {least:e} in {}", T::NAME);
 }
 
 /// Runs `f` on the values of all gradients. Each is one dense tensor, or rows with each index once.
@@ -125,12 +132,15 @@ fn limit_norm<T: Scalar>(values: &mut [Tensor<T>], bound: f64) -> Clipped {
     if norm <= bound {
         return Clipped { norm, factor: 1.0, bad };
     }
-    // Not `bound / norm`, since the norm itself may be too large for an f64.
-    let factor = bound / largest / sum.sqrt();
+    // Not `bound / norm`, since the norm itself may be too large for an f64. The factor may be too small for the type
+    // where no product is: it is applied as a power of two near its root, which rounds nothing, and the rest.
+    let root = sum.sqrt();
+    let power = ((bound.log2() - largest.log2() - root.log2()) / 2.0).max(-1020.0) as i32;
+    let power = 2.0_f64.powi(power.min(0));
     for value in values {
-        scale(value.as_mut_slice(), factor);
+        scale(value.as_mut_slice(), [power, bound / power / root / largest]);
     }
-    Clipped { norm, factor, bad }
+    Clipped { norm, factor: bound / largest / root, bad }
 }
 
 /// The largest finite magnitude, the sum of squares of all finite elements divided by it, and the number of other
@@ -143,7 +153,9 @@ fn parts<T: Scalar>(grads: &[Tensor<T>]) -> (f64, f64, usize) {
         bad += others;
     }
     let largest = largest.to_f64();
-    let sum = if largest > 0.0 { grads.iter().map(|grad| squares(grad.as_slice(), largest)).sum() } else { 0.0 };
+    // Sums of sums, so that rounding errors do not add up over all elements.
+    let chunks = grads.iter().flat_map(|grad| grad.as_slice().chunks(CHUNK));
+    let sum = if largest > 0.0 { chunks.map(|chunk| squares(chunk, largest)).sum() } else { 0.0 };
     (largest, sum, bad)
 }
 
@@ -190,13 +202,13 @@ fn square<T: Scalar>(x: T, largest: f64) -> f64 {
     x * x
 }
 
-fn scale<T: Scalar>(x: &mut [T], factor: f64) {
-    let factor = T::from_f64(factor);
+fn scale<T: Scalar>(x: &mut [T], factors: [f64; 2]) {
+    let [power, factor] = factors.map(T::from_f64);
     simd::dispatch(
         #[inline(always)]
         || {
             for x in x.iter_mut() {
-                *x = if x.is_finite() { flushed(*x * factor) } else { *x };
+                *x = if x.is_finite() { flushed(*x * power * factor) } else { *x };
             }
         },
     );

@@ -38,9 +38,9 @@ pub enum Schedule {
     },
     /// Exponential decay: `from * (to / from)^fraction`, after a linear warm-up from 0.
     Exponential {
-        /// Learning rate at the start. Range: more than 0, to 1e30.
+        /// Learning rate at the start. Range: 1e-30 to 1e30.
         from: f64,
-        /// Learning rate at the end. Range: more than 0, to 1e30.
+        /// Learning rate at the end. Range: 1e-30 to 1e30.
         to: f64,
         /// Fraction of the run for the warm-up, over which the rate rises from 0. Range: 0 to 1.
         warmup: f64,
@@ -76,28 +76,28 @@ impl Schedule {
         let rise = |warmup: f64| if fraction < warmup { fraction / warmup } else { 1.0 };
         match *self {
             Schedule::Constant { lr } => lr,
-            Schedule::Linear { from, to, warmup } => rise(warmup) * (from + (to - from) * fraction),
+            Schedule::Linear { from, to, warmup } => rise(warmup) * between([from, to], [1.0 - fraction, fraction]),
             Schedule::Step { from, factor, every, warmup } => {
-                // A fraction such as 0.3 is a little less than three times 0.1.
-                let stairs = (fraction / every + 1e-9).floor();
+                // A fraction such as 0.3 is some roundings less than three times 0.1.
+                let stairs = (fraction / every * (1.0 + 2.0 * f64::EPSILON)).floor();
                 rise(warmup) * from * factor.powf(stairs)
             }
             Schedule::Exponential { from, to, warmup } => rise(warmup) * from * (to / from).powf(fraction),
             Schedule::Cosine { from, to, warmup } => {
-                let half = 0.5 + 0.5 * (std::f64::consts::PI * fraction).cos();
-                rise(warmup) * (to + (from - to) * half)
+                let half = |share: f64| (std::f64::consts::FRAC_PI_2 * share).sin().powi(2);
+                rise(warmup) * between([from, to], [half(1.0 - fraction), half(fraction)])
             }
         }
     }
 
-    /// Checks that the numbers are in their ranges. Rates are 0 to 1e30, which leaves f32 room for multiples, and more
-    /// than 0 in [`Exponential`](Self::Exponential). Fractions of the run are 0 to 1, and `every` is more than 0.
+    /// Checks that the numbers are in their ranges. Rates are 0 to 1e30, which leaves f32 room for multiples, and at
+    /// least 1e-30 in [`Exponential`](Self::Exponential). Fractions of the run are 0 to 1, and `every` is more than 0.
     ///
     /// # Errors
     /// If a number is not in its range. The error has its name.
     pub fn check(&self) -> Result<(), SettingError> {
         let check_warmup = |warmup| check("warmup", warmup, (0.0..=1.0).contains(&warmup), "0 to 1");
-        let check_ratio = |name, rate| check(name, rate, rate > 0.0, "more than 0");
+        let check_ratio = |name, rate| check(name, rate, (1e-30..=1e30).contains(&rate), "1e-30 to 1e30");
         match *self {
             Schedule::Constant { lr } => check_rate("lr", lr),
             Schedule::Linear { from, to, warmup } | Schedule::Cosine { from, to, warmup } => {
@@ -112,8 +112,8 @@ impl Schedule {
                 check_warmup(warmup)
             }
             Schedule::Exponential { from, to, warmup } => {
-                check_rate("from", from).and(check_ratio("from", from))?;
-                check_rate("to", to).and(check_ratio("to", to))?;
+                check_ratio("from", from)?;
+                check_ratio("to", to)?;
                 check_warmup(warmup)
             }
         }
@@ -124,6 +124,13 @@ impl Schedule {
     pub fn at_step(&self, step: u64, steps: u64) -> f64 {
         self.lr((step as f64 + 0.5) / steps.max(1) as f64)
     }
+}
+
+/// The mean of two rates whose weights add up to 1. It starts at the rate of the larger weight: so it is exact at both
+/// ends and for equal rates, and a small rate keeps its digits beside a large one.
+fn between(rates: [f64; 2], weights: [f64; 2]) -> f64 {
+    let near = usize::from(weights[1] > weights[0]);
+    rates[near] + (rates[1 - near] - rates[near]) * weights[1 - near]
 }
 
 #[cfg(test)]
@@ -186,8 +193,8 @@ mod tests {
             (Schedule::Linear { from: -1.0, to: 0.0, warmup: 0.0 }, "`from` is -1.0; use 0 to 1e30"),
             (Schedule::Cosine { from: 1.0, to: f64::INFINITY, warmup: 0.0 }, "`to` is inf; use 0 to 1e30"),
             (Schedule::Linear { from: 1.0, to: 0.0, warmup: 1.5 }, "`warmup` is 1.5; use 0 to 1"),
-            (Schedule::Exponential { from: 1.0, to: 0.0, warmup: 0.0 }, "`to` is 0.0; use more than 0"),
-            (Schedule::Exponential { from: 0.0, to: 1.0, warmup: 0.0 }, "`from` is 0.0; use more than 0"),
+            (Schedule::Exponential { from: 1.0, to: 0.0, warmup: 0.0 }, "`to` is 0.0; use 1e-30 to 1e30"),
+            (Schedule::Exponential { from: 0.0, to: 1.0, warmup: 0.0 }, "`from` is 0.0; use 1e-30 to 1e30"),
             (Schedule::Step { from: 1.0, factor: 2.0, every: 0.1, warmup: 0.0 }, "`factor` is 2.0; use 0 to 1"),
             (
                 Schedule::Step { from: 1.0, factor: 0.5, every: 0.0, warmup: 0.0 },
