@@ -648,7 +648,7 @@ fn config_ranges_equal_those_of_check() {
     let samples = Samples::new().values;
     let range = |path: &str, ty: &str| range(path, ty, &samples);
     assert_eq!(range(".config.field{instant}.grid.levels", "usize").as_deref(), Some("1 to 32"));
-    assert_eq!(range(".config.schedule.exponential.to", "f64").as_deref(), Some("more than 0, to 1e30"));
+    assert_eq!(range(".config.schedule.exponential.to", "f64").as_deref(), Some("1e-30 to 1e30"));
     assert_eq!(range(".keep_checkpoints", "usize").as_deref(), Some("2 to 16384"));
     assert_eq!(range(".config.seed", "u64"), None);
 }

@@ -43,13 +43,13 @@ pub struct AdamW;
 /// The constants of [`Adam`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AdamConfig {
-    /// Decay of the first moment. Range: 0 to 1 - 2^-20 (1 - 2^-49 in f64).
+    /// Decay of the first moment. In f64 it can be up to 1 - 2^-49. Range: 0 to 1 - 2^-20.
     pub beta1: f64,
-    /// Decay of the second moment. Range: 0 to 1 - 2^-20 (1 - 2^-49 in f64).
+    /// Decay of the second moment. In f64 it can be up to 1 - 2^-49. Range: 0 to 1 - 2^-20.
     pub beta2: f64,
     /// Added to the root of the second moment. It bounds the step of elements with tiny gradients: 1e-8 suits dense
-    /// networks, 1e-15 hash tables. In f32, a `beta2` above 0.9999 takes at least 1e-10. Range: 1e-15 to 1e30 (1e-30 to
-    /// 1e30 in f64).
+    /// networks, 1e-15 hash tables. A `beta2` above 0.9999 takes at least 1e-10. In f64 it is at least 1e-30, for any
+    /// `beta2`. Range: 1e-15 to 1e30.
     #[serde(alias = "epsilon")]
     pub eps: f64,
 }
