@@ -228,7 +228,7 @@ pub(crate) fn powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
     let factor = x.like(f64::from(n));
     match n {
         1 => s,
-        2 => s * x * factor,
+        2 => s * (x * factor),
         3 => E::checked(s * x * x * factor, [s, x], [], || (s.wide() * factor.wide() * x.wide() * x.wide()).narrow()),
         4 => {
             let exact = || (s.wide() * factor.wide() * x.wide() * x.wide() * x.wide()).narrow();

@@ -12,8 +12,8 @@ macro_rules! wide {
         pub mod $t {
             use super::power;
             use crate::vmath::$t::{ROUND, clamp, erf_near, expm1_of_rest, polynomial, round_product};
-            use std::$t::consts::{FRAC_1_SQRT_2, LOG2_E};
             use std::ops::{Div, Mul};
+            use std::$t::consts::{FRAC_1_SQRT_2, LOG2_E};
 
             /// `mantissa * 2^exponent`. The mantissa is within a few powers of two of 1, or it is 0, infinite or NaN.
             #[derive(Debug, Clone, Copy)]

@@ -74,6 +74,11 @@ impl Exact {
         self.high < 0.0
     }
 
+    /// The nearest f64, and the rest.
+    pub fn parts(self) -> [f64; 2] {
+        [self.high, self.low].map(|part| scaled(part, self.exponent))
+    }
+
     /// The exponent of the leading digit.
     pub fn exponent(self) -> i64 {
         self.exponent
@@ -248,7 +253,8 @@ impl Exact {
 
     pub fn sinh(self) -> Exact {
         let t = self.abs().expm1();
-        let y = if self.exponent > 8 { self.abs().exp().shifted(-1) } else { (t + t / (t + Exact::new(1.0))).shifted(-1) };
+        let y =
+            if self.exponent > 8 { self.abs().exp().shifted(-1) } else { (t + t / (t + Exact::new(1.0))).shifted(-1) };
         if self.is_negative() { -y } else { y }
     }
 
@@ -338,7 +344,8 @@ fn quarters(x: f64) -> (i64, Exact) {
         let digit = u64::from(TWO_OVER_PI.get(first as usize + k).copied().unwrap_or(0));
         let (low, high) = ((whole & 0xffff_ffff) * digit, (whole >> 32) * digit);
         // digits are shifted by two places, for the carries of the first.
-        for (place, value) in [(k + 2, low & 0xffff_ffff), (k + 1, (low >> 32) + (high & 0xffff_ffff)), (k, high >> 32)] {
+        for (place, value) in [(k + 2, low & 0xffff_ffff), (k + 1, (low >> 32) + (high & 0xffff_ffff)), (k, high >> 32)]
+        {
             digits[place] += value;
         }
     }

@@ -3,6 +3,7 @@
 //! Values and gradients are compared one by one with a reference of 100 bits ([`exact`]). Arguments are drawn from all
 //! bit patterns, close to kinks and borders, and where functions are used; incoming gradients from all bit patterns, and
 //! so that the result is a normal number. `ACCURACY_DRAWS` sets how many, `ACCURACY_ONLY=gelu,tanh` which operations.
+//! `ACCURACY_DUMP` names a folder for arguments and exact results, which `benches/peers/accuracy.py` reads.
 
 mod exact;
 mod operations;
@@ -14,6 +15,36 @@ use rayon::prelude::*;
 
 /// Errors above this many units in the last place are breaches.
 const GATE: f64 = 8.0;
+
+/// The same for values of the functions of docs/library/vector-math.md that are within 2.
+const FUNCTIONS: [&str; 26] = [
+    "exp",
+    "expm1",
+    "exp2",
+    "ln",
+    "ln1p",
+    "log2",
+    "sqrt",
+    "erf",
+    "sin",
+    "cos",
+    "sin_pi",
+    "cos_pi",
+    "tan",
+    "asin",
+    "acos",
+    "atan",
+    "sinh",
+    "cosh",
+    "tanh",
+    "abs",
+    "sigmoid",
+    "softplus",
+    "atan2",
+    "hypot",
+    "pow",
+    "remainder",
+];
 
 /// A float format.
 struct Format {
@@ -31,6 +62,11 @@ impl Format {
         }
     }
 
+    /// The exponent of a unit in the last place of the exact result or of its largest term.
+    fn unit(&self, exact: Exact, term: Exact) -> i64 {
+        exact.exponent().max(term.exponent()).max(self.least) - self.digits
+    }
+
     /// The error of `got`, in units in the last place of the exact result or of its largest term. Infinite where the
     /// result should be infinite or NaN and is not, or the other way round.
     fn error(&self, got: f64, exact: Exact, term: Exact) -> f64 {
@@ -38,7 +74,7 @@ impl Format {
             let same = got == exact.to_f64() || got.is_nan() && exact.to_f64().is_nan();
             return if same { 0.0 } else { f64::INFINITY };
         }
-        let unit = exact.exponent().max(term.exponent()).max(self.least) - self.digits;
+        let unit = self.unit(exact, term);
         let (limit, sign) = (Exact::new(1.0).shifted(self.greatest + 1), if exact.is_negative() { -1.0 } else { 1.0 });
         if exact.abs() >= limit && got == sign * f64::INFINITY {
             return 0.0;
@@ -148,20 +184,50 @@ struct Column {
 }
 
 impl Column {
-    fn add(&mut self, error: f64, at: impl FnOnce() -> Vec<f64>) {
+    fn add(&mut self, error: f64, gate: f64, at: impl FnOnce() -> Vec<f64>) {
         if error > self.worst || self.count == 0 {
             (self.worst, self.at) = (error, at());
         }
         self.sum += if error.is_finite() { error } else { 0.0 };
         self.count += 1;
-        self.breaches += usize::from(!(error <= GATE));
+        self.breaches += usize::from(!(error <= gate));
+    }
+}
+
+/// A file of arguments, gradients and exact results for `benches/peers/accuracy.py`: the number of operands, and for each
+/// case the arguments, the
+/// incoming gradient, and for the value and each gradient what [`Dump::result`] writes.
+struct Dump(Option<std::io::BufWriter<std::fs::File>>);
+
+impl Dump {
+    fn new<T: Scalar>(name: &str, operands: usize) -> Dump {
+        let folder = std::env::var("ACCURACY_DUMP").ok().filter(|folder| !folder.is_empty());
+        let path = folder.map(|folder| format!("{folder}/{}.{}", name.replace(", ", "_"), T::NAME));
+        let mut dump = Dump(path.map(|path| std::io::BufWriter::new(std::fs::File::create(path).unwrap())));
+        dump.numbers(&[operands as f64]);
+        dump
+    }
+
+    fn numbers(&mut self, numbers: &[f64]) {
+        use std::io::Write;
+        if let Some(file) = &mut self.0 {
+            numbers.iter().for_each(|x| file.write_all(&x.to_le_bytes()).unwrap());
+        }
+    }
+
+    /// The exact result as a sum of two numbers in units in the last place, the exponent of the unit, and the error of
+    /// this result. A result that is not compared has NaN as its error.
+    fn result(&mut self, format: &Format, exact: Exact, term: Exact, error: f64) {
+        let unit = if exact.is_finite() { format.unit(exact, term) } else { 0 };
+        let [high, low] = exact.shifted(-unit).parts();
+        self.numbers(&[high, low, unit as f64, error]);
     }
 }
 
 /// The errors of the value and of the gradient by each operand.
 fn examine<T: Scalar>(operation: &Operation<T>, draws: usize) -> Vec<Column> {
     let mut columns = vec![Column::default(); 1 + operation.operands];
-    let format = Format::of::<T>();
+    let (format, mut dump) = (Format::of::<T>(), Dump::new::<T>(operation.name, operation.operands));
     for (batch, start) in (0..draws).step_by(1 << 14).enumerate() {
         let n = (draws - start).min(1 << 14);
         let cases: Vec<(Vec<f64>, Reference, f64)> = (0..n)
@@ -183,19 +249,23 @@ fn examine<T: Scalar>(operation: &Operation<T>, draws: usize) -> Vec<Column> {
         let grads = tape.no_grad(|| y.vjp(&tape.constant(column(&|i| cases[i].2)), &x.iter().collect::<Vec<_>>()));
         for (i, (x, reference, g)) in cases.iter().enumerate() {
             let value = y.value().as_slice()[i].to_f64();
-            let at = |g: Option<f64>| x.iter().copied().chain(g).collect();
-            if let Some((exact, term)) = reference.value {
-                columns[0].add(format.error(value, exact, term), || at(None));
-            }
-            if !value.is_finite() {
-                continue;
-            }
-            for (k, grad) in grads.iter().enumerate() {
-                let (slope, term) = reference.slopes[k];
-                let g_exact = Exact::new(*g);
-                if slope.is_finite() {
-                    let error = format.error(grad.value().as_slice()[i].to_f64(), g_exact * slope, g_exact * term);
-                    columns[1 + k].add(error, || at(Some(*g)));
+            dump.numbers(x);
+            dump.numbers(&[*g]);
+            let g_exact = Exact::new(*g);
+            let slopes = reference.slopes.iter().map(|&(slope, term)| Some((g_exact * slope, g_exact * term)));
+            let got = grads.iter().map(|grad| grad.value().as_slice()[i].to_f64());
+            for (k, (exact, got)) in
+                [reference.value].into_iter().chain(slopes).zip([value].into_iter().chain(got)).enumerate()
+            {
+                // Conventions decide at a few points, and derivatives of what is not finite are not compared.
+                let exact = exact.filter(|(exact, _)| k == 0 || exact.is_finite() && value.is_finite());
+                let is_compared = exact.is_some();
+                let gate = if k == 0 && FUNCTIONS.contains(&operation.name) { 2.0 } else { GATE };
+                let (exact, term) = exact.unwrap_or((Exact::ZERO, Exact::ZERO));
+                let error = if is_compared { format.error(got, exact, term) } else { f64::NAN };
+                dump.result(&format, exact, term, error);
+                if is_compared {
+                    columns[k].add(error, gate, || x.iter().copied().chain((k > 0).then_some(*g)).collect());
                 }
             }
         }

@@ -92,7 +92,11 @@ fn real_power(a: f64, b: f64) -> Exact {
 /// A power with a constant exponent; conventions decide at 0.
 fn constant_power(x: f64, p: f64) -> Reference {
     let y = real_power(x, p);
-    if x == 0.0 { Reference { value: None, slopes: vec![(Exact::new(NAN), y)] } } else { of(y, [Exact::new(p) * y / Exact::new(x)]) }
+    if x == 0.0 {
+        Reference { value: None, slopes: vec![(Exact::new(NAN), y)] }
+    } else {
+        of(y, [Exact::new(p) * y / Exact::new(x)])
+    }
 }
 
 fn pair([a, b]: [f64; 2]) -> [Exact; 2] {
@@ -358,7 +362,13 @@ fn smooth_l1(a: f64, b: f64, beta: f64) -> Reference {
     if r.abs() < beta {
         of(r.square().shifted(-1) / beta, [r / beta, -r / beta])
     } else {
-        let sign = Exact::new(if r.is_negative() { -1.0 } else if r.is_zero() { 0.0 } else { 1.0 });
+        let sign = Exact::new(if r.is_negative() {
+            -1.0
+        } else if r.is_zero() {
+            0.0
+        } else {
+            1.0
+        });
         of(r.abs() - beta.shifted(-1), [sign, -sign])
     }
 }
