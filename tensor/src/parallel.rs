@@ -206,7 +206,7 @@ mod tests {
         let classes: Vec<u32> = (0..1031).map(|i| i * 7 % 517).collect();
         write(&[1031], &|y| rows::cross_entropy_rows(wide, 517, &classes, y, &pool));
         write(&tall, &|y| rows::cross_entropy_rows_grad(wide, 517, &classes, column.as_slice(), y, &pool));
-        write(&[1031], &|y| rows::variance_rows(wide, 517, y));
+        write(&[1031], &|y| rows::variance_rows(wide, 517, T::ONE, false, y));
         write(&tall, &|y| rows::layer_norm_rows(wide, row.as_slice(), row.as_slice(), 1e-5, y));
         write(&[1033, 517], &|y| {
             let (dx, sums) = y.split_at_mut(wide.len());

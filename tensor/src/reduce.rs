@@ -2,6 +2,7 @@
 
 use crate::layout::inverse;
 use crate::parallel::{ELEMENT, PIECE, chunks, is_worthwhile};
+use crate::scale::powers;
 use crate::{Pool, Scalar, Shape, Tensor, map, simd};
 
 /// Independent partial sums: fills two 512-bit registers of f32 and hides the latency of addition.
@@ -42,7 +43,7 @@ pub fn sum<T: Scalar>(x: &[T]) -> T {
     chunks(&mut parts, 1, READ * x.len(), || (), &|_, i, part| {
         part[0] = pairwise(&x[i * PIECE..][..PIECE.min(x.len() - i * PIECE)]);
     });
-    let mut pairs = Pairs::<T, 40>::new();
+    let mut pairs = Pairs::<T, LANES, 40>::new();
     parts.into_iter().for_each(|part| pairs.push(part));
     folded(pairs.finish())
 }
@@ -53,7 +54,7 @@ fn pairwise<T: Scalar>(x: &[T]) -> [T; LANES] {
     simd::dispatch(
         #[inline(always)]
         || {
-            let mut pairs = Pairs::<T, DEPTH>::new();
+            let mut pairs = Pairs::<T, LANES, DEPTH>::new();
             for block in x.chunks(LANES * BLOCK) {
                 pairs.push(lanes(block));
             }
@@ -63,24 +64,24 @@ fn pairwise<T: Scalar>(x: &[T]) -> [T; LANES] {
 }
 
 /// A pairwise sum of a stream of terms: pairs of terms, pairs of pairs, and so on.
-struct Pairs<T, const DEPTH: usize> {
+pub(crate) struct Pairs<T, const WIDTH: usize, const DEPTH: usize> {
     /// Sums of runs of terms, as many as `count` has 1 bits, the longest first. `count` is below 2^DEPTH.
-    open: [[T; LANES]; DEPTH],
+    open: [[T; WIDTH]; DEPTH],
     count: u64,
 }
 
-impl<T: Scalar, const DEPTH: usize> Pairs<T, DEPTH> {
+impl<T: Scalar, const WIDTH: usize, const DEPTH: usize> Pairs<T, WIDTH, DEPTH> {
     #[inline(always)]
-    fn new() -> Self {
-        Pairs { open: [[T::ZERO; LANES]; DEPTH], count: 0 }
+    pub fn new() -> Self {
+        Pairs { open: [[T::ZERO; WIDTH]; DEPTH], count: 0 }
     }
 
     #[inline(always)]
-    fn push(&mut self, mut term: [T; LANES]) {
+    pub fn push(&mut self, mut term: [T; WIDTH]) {
         let mut top = self.count.count_ones() as usize;
         for _ in 0..self.count.trailing_ones() {
             top -= 1;
-            for i in 0..LANES {
+            for i in 0..WIDTH {
                 term[i] += self.open[top][i];
             }
         }
@@ -89,11 +90,11 @@ impl<T: Scalar, const DEPTH: usize> Pairs<T, DEPTH> {
     }
 
     #[inline(always)]
-    fn finish(self) -> [T; LANES] {
+    pub fn finish(self) -> [T; WIDTH] {
         let runs = self.count.count_ones() as usize;
         let mut total = self.open[runs.saturating_sub(1)];
         for run in self.open[..runs.saturating_sub(1)].iter().rev() {
-            for i in 0..LANES {
+            for i in 0..WIDTH {
                 total[i] += run[i];
             }
         }
@@ -223,6 +224,37 @@ pub fn sum_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -> Tens
     };
     let kept: Shape = std::iter::repeat_n(1, lead).chain(shape.iter().copied()).collect();
     sum_kept(x, &kept, pool).reshape(shape)
+}
+
+/// The mean over the axes along which `shape` broadcasts to the shape of `x`; NaN for no elements. It overflows only if
+/// the mean itself is too large.
+///
+/// # Panics
+/// If `shape` does not broadcast to the shape of `x`.
+#[track_caller]
+pub fn mean_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -> Tensor<T> {
+    let mean_of = |x: &Tensor<T>, divisor: T| {
+        map(
+            [&sum_to(x, shape, pool)],
+            pool,
+            #[inline(always)]
+            |[sum]| sum / divisor,
+        )
+    };
+    let count = x.len() as f64 / shape.iter().product::<usize>() as f64;
+    let mean = mean_of(x, T::from_f64(count));
+    if mean.is_finite() || count.is_nan() || !x.is_finite() {
+        return mean;
+    }
+    // Half the reciprocal of the count, rounded down to a power of two: exact, and no sum of such products overflows.
+    let [down, _] = powers(T::from_f64(2.0 * count));
+    let small = map(
+        [x],
+        pool,
+        #[inline(always)]
+        |[x]| x * down,
+    );
+    mean_of(&small, T::from_f64(count) * down)
 }
 
 /// The sum over the axes whose extent is 1 in `kept`.

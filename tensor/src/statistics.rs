@@ -1,9 +1,94 @@
 //! Reductions of tensors: sum, mean, variance, maximum, minimum, norm.
 
 use crate::extremum::{arg_extremum, extremum};
-use crate::rows::variance_rows;
-use crate::{Axes, Indices, Real, Reduction, Scalar, Shape, Tensor, axis_of, sum_to};
+use crate::rows::{at_least_zero, in_units, variance_rows};
+use crate::scale::{is_safe, scales};
+use crate::{Axes, Indices, Pool, Real, Reduction, Scalar, Shape, Tensor, axis_of, map, mean_to, sum_to};
 use std::ops::Range;
+
+/// The variance over the axes whose extent is 1 in `kept`, or with `root` the standard deviation. The sum of squared
+/// deviations is divided by the number of elements minus `correction`. It overflows or underflows only if the result
+/// does.
+///
+/// # Panics
+/// If `kept` has another number of axes, or does not broadcast to the shape of `x`.
+#[track_caller]
+pub fn variance_to<T: Scalar>(x: &Tensor<T>, kept: &[usize], correction: f64, root: bool, pool: &Pool<T>) -> Tensor<T> {
+    assert_eq!(x.ndim(), kept.len(), "the variance of shape {:?} to {kept:?}", x.shape());
+    let count = x.len() as f64 / kept.iter().product::<usize>() as f64;
+    let ratio = T::from_f64(count / (count - correction).max(0.0));
+    let first = (0..x.ndim()).find(|&axis| x.shape()[axis] != kept[axis]).unwrap_or(x.ndim());
+    if kept[first..].iter().all(|&extent| extent == 1) {
+        let n = x.shape()[first..].iter().product();
+        return pool.filled(kept, |out| variance_rows(x.as_slice(), n, ratio, root, out));
+    }
+    // As `variance_rows`: deviations from the rounded mean, corrected for its rounding.
+    let variance = |x: &Tensor<T>| {
+        let deviation = map(
+            [x, &mean_to(x, kept, pool)],
+            pool,
+            #[inline(always)]
+            |[x, mean]| x - mean,
+        );
+        map(
+            [&mean_to(&squares(&deviation, pool), kept, pool), &mean_to(&deviation, kept, pool)],
+            pool,
+            #[inline(always)]
+            |[square, rest]| at_least_zero(square - rest * rest),
+        )
+    };
+    let plain = variance(x);
+    let finish = |variance: &Tensor<T>, unit: &Tensor<T>| {
+        map(
+            [variance, unit],
+            pool,
+            #[inline(always)]
+            |[variance, unit]| in_units(variance, ratio, unit, root),
+        )
+    };
+    if plain.iter().all(is_safe) {
+        return finish(&plain, &pool.full(&[], T::ONE));
+    }
+    let [down, unit] = scales(x, kept, pool);
+    finish(&variance(&times(x, &down, pool)), &unit)
+}
+
+/// The Euclidean norm over the axes whose extent is 1 in `kept`. It overflows or underflows only if the result does.
+///
+/// # Panics
+/// If `kept` does not broadcast to the shape of `x`.
+#[track_caller]
+pub fn norm_to<T: Scalar>(x: &Tensor<T>, kept: &[usize], pool: &Pool<T>) -> Tensor<T> {
+    let sums = sum_to(&squares(x, pool), kept, pool);
+    if sums.iter().all(is_safe) {
+        return sums.sqrt();
+    }
+    let [down, unit] = scales(x, kept, pool);
+    map(
+        [&sum_to(&squares(&times(x, &down, pool), pool), kept, pool), &unit],
+        pool,
+        #[inline(always)]
+        |[sum, unit]| sum.sqrt() * unit,
+    )
+}
+
+fn squares<T: Scalar>(x: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+    map(
+        [x],
+        pool,
+        #[inline(always)]
+        |[x]| x * x,
+    )
+}
+
+fn times<T: Scalar>(x: &Tensor<T>, by: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+    map(
+        [x, by],
+        pool,
+        #[inline(always)]
+        |[x, by]| x * by,
+    )
+}
 
 impl<T: Scalar> Tensor<T> {
     /// The sum of all elements. The sum is pairwise.
@@ -28,9 +113,9 @@ impl<T: Scalar> Tensor<T> {
         sum_to(self, &axes.kept(), &self.pool()).reshape(&axes.result())
     }
 
-    /// The mean of all elements; NaN for an empty tensor.
+    /// The mean of all elements; NaN for an empty tensor. It overflows only if the mean itself is too large.
     pub fn mean(&self) -> T {
-        T::from_f64(self.sum().to_f64() / self.len() as f64)
+        self.mean_over(..).item()
     }
 
     /// The mean over any axes; NaN if there are no elements.
@@ -40,7 +125,7 @@ impl<T: Scalar> Tensor<T> {
     #[track_caller]
     pub fn mean_over(&self, axes: impl Into<Axes>) -> Self {
         let axes = axes.into().resolve(self.shape());
-        (sum_to(self, &axes.kept(), &self.pool()) / T::from_f64(axes.count() as f64)).reshape(&axes.result())
+        mean_to(self, &axes.kept(), &self.pool()).reshape(&axes.result())
     }
 
     /// The reduced axes as the last one.
@@ -58,10 +143,7 @@ impl<T: Scalar> Tensor<T> {
     #[track_caller]
     pub fn var_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
         let axes = axes.into().resolve(self.shape());
-        let (rows, count) = (self.rows(&axes), axes.count() as f64);
-        let scale = T::from_f64(count / (count - correction as f64).max(0.0));
-        let out = self.pool().filled(&axes.result(), |out| variance_rows(rows.as_slice(), axes.count(), out));
-        out * scale
+        variance_to(self, &axes.kept(), correction as f64, false, &self.pool()).reshape(&axes.result())
     }
 
     /// The variance of all elements; see [`var_over`](Self::var_over).
@@ -74,13 +156,15 @@ impl<T: Scalar> Tensor<T> {
         self.std_over(.., correction).item()
     }
 
-    /// The standard deviation over any axes: the square root of [`var_over`](Self::var_over).
+    /// The standard deviation over any axes: the square root of [`var_over`](Self::var_over), also where the variance is
+    /// out of range.
     ///
     /// # Panics
     /// If an axis does not exist or is listed twice.
     #[track_caller]
     pub fn std_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
-        self.var_over(axes, correction).sqrt()
+        let axes = axes.into().resolve(self.shape());
+        variance_to(self, &axes.kept(), correction as f64, true, &self.pool()).reshape(&axes.result())
     }
 
     #[track_caller]
@@ -189,15 +273,7 @@ impl<T: Scalar> Tensor<T> {
 
     /// The Euclidean norm of all elements. It overflows only if the norm itself is too large.
     pub fn norm(&self) -> T {
-        if self.is_empty() {
-            return T::ZERO;
-        }
-        let largest = self.abs().max();
-        if largest == T::ZERO || !largest.is_finite() {
-            return largest;
-        }
-        let scaled = self / largest;
-        scaled.square().sum().sqrt() * largest
+        norm_to(self, &Axes::from(..).resolve(self.shape()).kept(), &self.pool()).item()
     }
 
     /// The largest absolute difference of two tensors of one shape. It is 0 for empty tensors, and NaN if a difference

@@ -2,6 +2,7 @@
 
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{layer_norm_rows, layer_norm_rows_grad};
+use raygrad_tensor::scale::scales;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
 /// y = (x - mean) / sqrt(variance + eps) gain + bias along the last axis, for x `[.., n]`, gain and bias `[n]`. The
@@ -55,9 +56,13 @@ impl<T: Scalar> Op<T> for LayerNorm {
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         let kept = Axes::from(-1).resolve(x[0].shape()).kept();
-        let centred = x[0].centred(&kept);
-        let variance = centred.square().mean_over(Axes::from(-1).keepdims());
-        Some(centred / (variance + self.eps).sqrt() * &x[1] + &x[2])
+        // In units of a power of two for each row, in which squares are in range. It cancels, so it is a constant.
+        let (tape, value) = (x[0].tape(), x[0].value());
+        let least = T::from_f64(self.eps.sqrt().min(1e38));
+        let [down, _] = scales(&value.abs().map(|x| x.maximum(least)), &kept, tape.pool());
+        let eps = down.map(|down| T::from_f64(self.eps * down.to_f64() * down.to_f64()));
+        let centred = (&x[0] * down).centred(&kept);
+        Some(&centred / (centred.square().mean_to(&kept) + eps).sqrt() * &x[1] + &x[2])
     }
 }
 

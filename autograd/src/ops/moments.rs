@@ -1,55 +1,14 @@
 //! Variance, standard deviation and norms.
 
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::extremum::extremum;
-use raygrad_tensor::rows::{at_least_zero, variance_rows};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, map, sum_to};
-
-/// The number of elements in each row, if a tensor of shape `x` is reduced to `to` over its last axes alone.
-fn trailing(x: &[usize], to: &[usize]) -> Option<usize> {
-    let first = (0..x.len()).find(|&axis| x[axis] != to[axis]).unwrap_or(x.len());
-    to[first..].iter().all(|&extent| extent == 1).then(|| x[first..].iter().product())
-}
+use raygrad_tensor::scale::powers;
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, norm_to, variance_to};
 
 fn check_kept(x: &[usize], to: &[usize]) -> Result<Shape, ShapeError> {
     match broadcast_shape(&[x, to]) {
         Some(wide) if wide.as_slice() == x && x.len() == to.len() => Ok(Shape::from_slice(to)),
         _ => Err(format!("cannot be reduced to {to:?}")),
     }
-}
-
-/// The sum of squared deviations from the mean, divided by `count - correction`.
-fn variance<T: Scalar>(x: &Tensor<T>, shape: &[usize], correction: f64, pool: &Pool<T>) -> Tensor<T> {
-    let mut out = pool.tensor(shape);
-    let count = x.len() as f64 / out.len() as f64;
-    let ratio = T::from_f64(count / (count - correction).max(0.0));
-    if let Some(n) = trailing(x.shape(), shape) {
-        variance_rows(x.as_slice(), n, out.as_mut_slice());
-    } else {
-        // As `variance_rows`: deviations from the rounded mean, corrected for its rounding.
-        let count = T::from_f64(count);
-        let mean_of = |x: &Tensor<T>| {
-            map(
-                [&sum_to(x, shape, pool)],
-                pool,
-                #[inline(always)]
-                |[sum]| sum / count,
-            )
-        };
-        let deviation = map(
-            [x, &mean_of(x)],
-            pool,
-            #[inline(always)]
-            |[x, mean]| x - mean,
-        );
-        out = map(
-            [&mean_of(&deviation.square()), &mean_of(&deviation)],
-            pool,
-            #[inline(always)]
-            |[square, rest]| at_least_zero(square - rest * rest),
-        );
-    }
-    if correction == 0.0 { out } else { out * ratio }
 }
 
 /// y = the variance over the axes along which `shape` has extent 1: the sum of squared deviations from the mean,
@@ -62,7 +21,8 @@ pub struct Variance {
     pub correction: f64,
 }
 
-/// y = the square root of [`Variance`]; dx = g (x - mean) / (y (n - correction)), 0 where y is 0.
+/// y = the square root of [`Variance`], also where that is out of range; dx = g (x - mean) / (y (n - correction)), 0
+/// where y is 0.
 #[derive(Clone)]
 pub struct Deviation(
     /// The variance.
@@ -70,10 +30,10 @@ pub struct Deviation(
 );
 
 impl Variance {
-    /// `share (x - mean) / (n - correction)`.
-    fn centred<'t, T: Scalar>(&self, x: &Var<'t, T>, share: &Var<'t, T>) -> Var<'t, T> {
-        let count = x.value().len() as f64 / self.shape.iter().product::<usize>() as f64;
-        x.centred(&self.shape) * (share * (1.0 / (count - self.correction).max(0.0)))
+    /// `1 / (n - correction)` for an input of shape `x`.
+    fn share(&self, x: &[usize]) -> f64 {
+        let [from, to] = [x, &self.shape].map(|shape| shape.iter().product::<usize>() as f64);
+        1.0 / (from / to - self.correction).max(0.0)
     }
 }
 
@@ -87,11 +47,11 @@ impl<T: Scalar> Op<T> for Variance {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        variance(x[0], &self.shape, self.correction, pool)
+        variance_to(x[0], &self.shape, self.correction, false, pool)
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(self.centred(&cx.x(0), &(cx.g() * 2.0)))
+        Grads::one(cx.x(0).centred(&self.shape) * (cx.g() * (2.0 * self.share(cx.shape(0)))))
     }
 }
 
@@ -105,7 +65,7 @@ impl<T: Scalar> Op<T> for Deviation {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        variance(x[0], &self.0.shape, self.0.correction, pool).sqrt()
+        variance_to(x[0], &self.0.shape, self.0.correction, true, pool)
     }
 
     fn reads(&self) -> Reads {
@@ -113,16 +73,26 @@ impl<T: Scalar> Op<T> for Deviation {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(self.0.centred(&cx.x(0), &over_unless_zero(cx.g(), &cx.y())))
+        let (shape, x, y) = (&self.0.shape, cx.x(0), cx.y());
+        let share = cx.g() * self.0.share(cx.shape(0));
+        let quotient = |y: &Var<'t, T>| &share / unless_zero(y);
+        let plain = quotient(&y);
+        let is_safe = |x: T| (1e-30..1e30).contains(&x.to_f64().abs());
+        let [values, sizes, shares] = [&plain, &y, &share].map(|x| x.value().as_slice());
+        let is_plain =
+            |i: usize| sizes[i] == T::ZERO || is_safe(sizes[i]) && (shares[i] == T::ZERO || is_safe(values[i]));
+        if (0..sizes.len()).all(is_plain) {
+            return Grads::one(x.centred(shape) * plain);
+        }
+        // In units of the deviation, rounded to a power of two. It cancels, so it is a constant.
+        let down = cx.constant(y.value().map(|y| powers(y)[0]));
+        Grads::one((x * &down).centred(shape) * quotient(&(y * down)))
     }
 }
 
-/// `g / y`, and 0 where `y` is 0.
-fn over_unless_zero<'t, T: Scalar>(g: &Var<'t, T>, y: &Var<'t, T>) -> Var<'t, T> {
-    let (zero, one) = (y.constant(0.0), y.constant(1.0));
-    let is_zero = y.elementwise_eq(0.0);
-    // Divided by 1 where it is not chosen, so that the next derivative is not NaN.
-    zero.where_(&is_zero, &(g / one.where_(&is_zero, y)))
+/// `y`, and infinity where it is 0: a quotient by it is 0 there, and so are its derivatives.
+fn unless_zero<'t, T: Scalar>(y: &Var<'t, T>) -> Var<'t, T> {
+    y.constant(f64::INFINITY).where_(&y.elementwise_eq(0.0), y)
 }
 
 /// y = sqrt(sum of x^2) over the axes along which `shape` has extent 1, without overflow on the way. dx = g x / y, 0
@@ -143,50 +113,7 @@ impl<T: Scalar> Op<T> for Norm {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let squares = |x: &Tensor<T>| {
-            let square = map(
-                [x],
-                pool,
-                #[inline(always)]
-                |[x]| x * x,
-            );
-            sum_to(&square, &self.shape, pool)
-        };
-        let sums = squares(x[0]);
-        // Sums in this range have lost nothing to overflow or underflow.
-        let (least, most) = (T::from_f64(1e-25), T::from_f64(1e37));
-        if sums.as_slice().iter().all(|&sum| sum > least && sum < most) {
-            return sums.sqrt();
-        }
-        // Else in units of the greatest element.
-        let mut size = map(
-            [x[0]],
-            pool,
-            #[inline(always)]
-            |[x]| x.abs(),
-        );
-        if size.is_empty() {
-            return sums;
-        }
-        for axis in (0..self.shape.len()).filter(|&axis| self.shape[axis] == 1) {
-            let mut shape = Shape::from_slice(size.shape());
-            let middle = [shape[..axis].iter().product(), shape[axis], shape[axis + 1..].iter().product()];
-            shape[axis] = 1;
-            let mut out = pool.tensor(&shape);
-            extremum(size.as_slice(), middle, true, out.as_mut_slice());
-            size = out;
-        }
-        let unit = map(
-            [x[0], &size],
-            pool,
-            #[inline(always)]
-            |[x, size]| {
-                let quotient = x / size;
-                let limit = if size > T::ZERO { T::ONE } else { size };
-                if size > T::ZERO && size.is_finite() { quotient } else { limit }
-            },
-        );
-        size * squares(&unit).sqrt()
+        norm_to(x[0], &self.shape, pool)
     }
 
     fn reads(&self) -> Reads {
@@ -195,7 +122,7 @@ impl<T: Scalar> Op<T> for Norm {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         // x / y first: g / y may overflow where the quotient is of order 1.
-        Grads::one(over_unless_zero(&cx.x(0), &cx.y()) * cx.g())
+        Grads::one(cx.x(0) / unless_zero(&cx.y()) * cx.g())
     }
 }
 
@@ -203,9 +130,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// This tensor minus its mean over the axes along which `shape` has extent 1. It subtracts twice: the second time
     /// removes the rounding error of a large mean.
     pub(crate) fn centred(&self, shape: &[usize]) -> Self {
-        let share = shape.iter().product::<usize>() as f64 / self.value().len() as f64;
-        let once = self - self.sum_to(shape) * share;
-        &once - once.sum_to(shape) * share
+        let once = self - self.mean_to(shape);
+        &once - once.mean_to(shape)
     }
 
     /// The variance of all elements, as a scalar; see [`var_over`](Self::var_over).
@@ -236,8 +162,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.std_over(.., correction)
     }
 
-    /// The standard deviation over any axes: the square root of [`var_over`](Self::var_over). Where it is 0, the
-    /// gradient is 0.
+    /// The standard deviation over any axes: the square root of [`var_over`](Self::var_over), also where that overflows
+    /// or underflows. Where it is 0, the gradient is 0.
     ///
     /// # Panics
     /// If an axis does not exist or is named twice.

@@ -2,7 +2,7 @@
 
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::Reduction;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, sum_to};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, mean_to, sum_to};
 
 /// y = x summed over the axes along which `shape` broadcasts to the shape of x; dx = g broadcast.
 #[derive(Clone)]
@@ -11,16 +11,28 @@ pub struct SumTo {
     pub shape: Shape,
 }
 
+/// y = [`SumTo`] divided by the number of elements; dx = g broadcast, divided by it. It overflows only if the mean does.
+#[derive(Clone)]
+pub struct MeanTo {
+    /// The shape of the output, which broadcasts to the shape of the input.
+    pub shape: Shape,
+}
+
+/// The shape `to`, if a tensor of shape `x` can be summed to it.
+fn summed(x: &[usize], to: &Shape) -> Result<Shape, ShapeError> {
+    match broadcast_shape(&[x, to]) {
+        Some(wide) if wide.as_slice() == x => Ok(to.clone()),
+        _ => Err(format!("cannot be summed to {to:?}")),
+    }
+}
+
 impl<T: Scalar> Op<T> for SumTo {
     fn name(&self) -> &'static str {
         "sum"
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        match broadcast_shape(&[x[0], &self.shape]) {
-            Some(wide) if wide.as_slice() == x[0] => Ok(self.shape.clone()),
-            _ => Err(format!("cannot be summed to {:?}", self.shape)),
-        }
+        summed(x[0], &self.shape)
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
@@ -33,6 +45,29 @@ impl<T: Scalar> Op<T> for SumTo {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         Grads::one(cx.g().broadcast_to(cx.shape(0)))
+    }
+}
+
+impl<T: Scalar> Op<T> for MeanTo {
+    fn name(&self) -> &'static str {
+        "mean"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        summed(x[0], &self.shape)
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        mean_to(x[0], &self.shape, pool)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let [from, to] = [cx.shape(0), &self.shape].map(|shape| shape.iter().product::<usize>() as f64);
+        Grads::one((cx.g() / (from / to)).broadcast_to(cx.shape(0)))
     }
 }
 
@@ -75,10 +110,11 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.sum_to(&[])
     }
 
-    /// The mean of all elements, as a scalar; NaN for an empty tensor.
+    /// The mean of all elements, as a scalar; NaN for an empty tensor. It overflows only if the mean itself is too
+    /// large.
     #[track_caller]
     pub fn mean(&self) -> Self {
-        self.sum() / self.value().len() as f64
+        self.mean_to(&[])
     }
 
     /// The sum over any axes; 0 if there are no elements.
@@ -106,7 +142,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn mean_over(&self, axes: impl Into<Axes>) -> Self {
         let axes = self.axes("mean_over", axes);
-        (self.sum_to(&axes.kept()) / axes.count() as f64).reshape(&axes.result())
+        self.mean_to(&axes.kept()).reshape(&axes.result())
+    }
+
+    /// The mean over the axes along which `shape` broadcasts to the shape of this tensor.
+    #[track_caller]
+    pub(crate) fn mean_to(&self, shape: &[usize]) -> Self {
+        self.tape().apply(MeanTo { shape: shape.into() }, &[self])
     }
 
     /// `[kept elements, reduced elements]`, with the reduced axes moved to the end.

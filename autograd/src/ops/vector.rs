@@ -1,6 +1,7 @@
 //! Vectors along the last axis: cross product and normalisation.
 
 use crate::{Axes, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::scale::largest;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape};
 
 /// y = a x b along the last axis of extent 3, with broadcasting; da = b x g, db = g x a.
@@ -47,19 +48,6 @@ impl<T: Scalar> Op<T> for Cross {
 /// zeros, with gradient 0. Where the gradient of a tiny row would overflow, it is the largest finite number.
 #[derive(Clone, Copy)]
 pub struct Normalize;
-
-/// The largest absolute value of a row, NaN if there is one.
-fn largest<T: Scalar>(row: &[T]) -> T {
-    let mut largest = T::ZERO;
-    for &x in row {
-        let x = if x < T::ZERO { -x } else { x };
-        largest = if x <= largest { largest } else { x };
-        if x.partial_cmp(&x).is_none() {
-            return x;
-        }
-    }
-    largest
-}
 
 /// The norm of `row / scale`, with the quotients written to `unit`.
 fn scaled_norm<T: Scalar>(row: &[T], scale: T, unit: &mut [T], squares: &mut [T]) -> T {

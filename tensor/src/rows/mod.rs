@@ -7,14 +7,15 @@
 mod moments;
 mod softmax;
 
-pub use moments::{at_least_zero, layer_norm_rows, layer_norm_rows_grad, variance_rows};
+pub(crate) use moments::{at_least_zero, in_units};
+pub use moments::{layer_norm_rows, layer_norm_rows_grad, variance_rows};
 pub use softmax::{
     cross_entropy_rows, cross_entropy_rows_grad, log_softmax_rows, log_softmax_rows_grad, logsumexp_rows, softmax_rows,
     softmax_rows_grad,
 };
 
 use crate::parallel::chunks;
-use crate::reduce::{chunk, sum};
+use crate::reduce::{Pairs, chunk, sum};
 use crate::{Pool, Scalar, Tensor};
 
 /// Elements of a block: 16 kB of f32.
@@ -105,8 +106,8 @@ fn total<T: Scalar>(x: &[T]) -> T {
 #[inline(always)]
 fn totals_of<T: Scalar, const K: usize>(a: &[T], b: &[T], f: impl Fn(T, T) -> [T; K]) -> [T; K] {
     let b = &b[..a.len()];
-    let mut sums = [T::ZERO; K];
     if a.len() < LANES {
+        let mut sums = [T::ZERO; K];
         for i in 0..a.len() {
             let values = f(a[i], b[i]);
             for k in 0..K {
@@ -115,31 +116,42 @@ fn totals_of<T: Scalar, const K: usize>(a: &[T], b: &[T], f: impl Fn(T, T) -> [T
         }
         return sums;
     }
-    // Sums of blocks, so that the error of a long row grows with the number of blocks.
+    if a.len() <= BLOCK {
+        return block_totals(a, b, &f);
+    }
+    let mut pairs = Pairs::<T, K, 40>::new();
     for (a, b) in a.chunks(BLOCK).zip(b.chunks(BLOCK)) {
-        let mut lanes = [[T::ZERO; LANES]; K];
-        let whole = a.len() - a.len() % LANES;
-        let mut start = 0;
-        while start < whole {
-            let (a, b) = (&a[start..start + LANES], &b[start..start + LANES]);
-            for i in 0..LANES {
-                let values = f(a[i], b[i]);
-                for k in 0..K {
-                    lanes[k][i] += values[k];
-                }
-            }
-            start += LANES;
-        }
-        let (a, b) = (&a[whole..], &b[whole..]);
-        for i in 0..a.len() {
+        pairs.push(block_totals(a, b, &f));
+    }
+    pairs.finish()
+}
+
+/// [`totals_of`] a block.
+#[inline(always)]
+fn block_totals<T: Scalar, const K: usize>(a: &[T], b: &[T], f: &impl Fn(T, T) -> [T; K]) -> [T; K] {
+    let mut lanes = [[T::ZERO; LANES]; K];
+    let whole = a.len() - a.len() % LANES;
+    let mut start = 0;
+    while start < whole {
+        let (a, b) = (&a[start..start + LANES], &b[start..start + LANES]);
+        for i in 0..LANES {
             let values = f(a[i], b[i]);
             for k in 0..K {
                 lanes[k][i] += values[k];
             }
         }
+        start += LANES;
+    }
+    let (a, b) = (&a[whole..], &b[whole..]);
+    for i in 0..a.len() {
+        let values = f(a[i], b[i]);
         for k in 0..K {
-            sums[k] += chunk(&lanes[k]);
+            lanes[k][i] += values[k];
         }
+    }
+    let mut sums = [T::ZERO; K];
+    for k in 0..K {
+        sums[k] = chunk(&lanes[k]);
     }
     sums
 }

@@ -2,6 +2,7 @@
 
 use super::{ROW_ELEMENT, block, blocks, check_rows, check_whole, total, totals_of};
 use crate::parallel::chunks;
+use crate::scale::{is_safe, largest, powers};
 use crate::{Pool, Scalar, Tensor, simd};
 
 /// Rows whose gradients are summed in their own type before they are added to f64 sums.
@@ -29,16 +30,35 @@ fn moments<T: Scalar>(x: &[T]) -> ([T; 2], T) {
 
 /// 0 in place of a negative number, as rounding makes of the variance of equal numbers. NaN stays.
 #[inline(always)]
-pub fn at_least_zero<T: Scalar>(x: T) -> T {
+pub(crate) fn at_least_zero<T: Scalar>(x: T) -> T {
     if x < T::ZERO { T::ZERO } else { x }
 }
 
-/// The variance of each row of `n` elements, divided by `n`; NaN for an empty row.
+/// `variance * ratio`, or its square root, of numbers in units of the power of two `unit`.
+#[inline(always)]
+pub(crate) fn in_units<T: Scalar>(variance: T, ratio: T, unit: T, root: bool) -> T {
+    let variance = variance * ratio;
+    if root { variance.sqrt() * unit } else { variance * unit * unit }
+}
+
+/// The row times a power of two.
+fn times<T: Scalar>(x: &[T], power: T) -> Vec<T> {
+    x.iter().map(|&x| x * power).collect()
+}
+
+/// The variance of each row of `n` elements, or with `root` the standard deviation; NaN for an empty row. The sum of
+/// squared deviations is divided by `n` and multiplied by `ratio`. It overflows or underflows only if the result does.
 ///
 /// # Panics
 /// If `x` is not `out.len()` rows of `n`.
 #[track_caller]
-pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
+pub fn variance_rows<T: Scalar>(x: &[T], n: usize, ratio: T, root: bool, out: &mut [T]) {
+    #[cold]
+    #[inline(never)]
+    fn scaled<T: Scalar>(x: &[T], ratio: T, root: bool) -> T {
+        let [down, unit] = powers(largest(x));
+        in_units(moments(&times(x, down)).1, ratio, unit, root)
+    }
     check_rows(x.len(), n, out.len());
     if n == 0 {
         out.fill(T::from_f64(f64::NAN));
@@ -50,15 +70,50 @@ pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
             #[inline(always)]
             || {
                 for (x, out) in x[i * rows * n..].chunks_exact(n).zip(out) {
-                    *out = moments(x).1;
+                    let variance = moments(x).1;
+                    *out = if is_safe(variance) {
+                        in_units(variance, ratio, T::ONE, root)
+                    } else {
+                        scaled(x, ratio, root)
+                    };
                 }
             },
         );
     });
 }
 
+/// What normalises a row: `((x - mean[0]) - mean[1]) * scale`, for the elements times the power of two `down`.
+struct Standard<T> {
+    mean: [T; 2],
+    scale: T,
+    down: T,
+}
+
+/// The row, and what normalises it. Where squares leave the range of the type, it is a multiple of the row in `space`.
+#[inline(always)]
+fn standard<'a, T: Scalar>(x: &'a [T], eps: f64, space: &'a mut Vec<T>) -> (&'a [T], Standard<T>) {
+    #[cold]
+    #[inline(never)]
+    fn scaled<T: Scalar>(x: &[T], eps: f64, space: &mut Vec<T>) -> Standard<T> {
+        let [down, _] = powers(largest(x).maximum(T::from_f64(eps.sqrt().min(1e38))));
+        *space = times(x, down);
+        let (mean, variance) = moments(space);
+        // In f64, where epsilon is not rounded to 0. One factor after the other: the square of `down` may overflow.
+        let eps = eps * down.to_f64() * down.to_f64();
+        Standard { mean, scale: T::ONE / (variance + T::from_f64(eps)).sqrt(), down }
+    }
+    let (mean, variance) = moments(x);
+    let sum = variance + T::from_f64(eps);
+    if is_safe(sum) {
+        return (x, Standard { mean, scale: T::ONE / sum.sqrt(), down: T::ONE });
+    }
+    let standard = scaled(x, eps, space);
+    (space, standard)
+}
+
 /// Layer normalisation of each row: `(x - mean) / sqrt(variance + eps) * gain + bias`, with the variance divided by
 /// `n`.
+/// It is right wherever the result is in range, whatever the squares.
 ///
 /// # Panics
 /// If `gain` and `bias` have different lengths, `x` is not whole rows of that length, or `out` is shorter than `x`.
@@ -70,15 +125,15 @@ pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out
     if x.is_empty() {
         return;
     }
-    let eps = T::from_f64(eps);
     blocks(&mut out[..x.len()], n, 0, &Pool::none(), &|_, start, out| {
+        let mut space = vec![];
         simd::dispatch(
             #[inline(always)]
             || {
                 let (gain, bias) = (&gain[..n], &bias[..n]);
                 for (x, out) in x[start..].chunks_exact(n).zip(out.chunks_exact_mut(n)) {
-                    let ([mean, rest], variance) = moments(x);
-                    let scale = T::ONE / (variance + eps).sqrt();
+                    let (x, Standard { mean: [mean, rest], scale, .. }) = standard(x, eps, &mut space);
+                    let x = &x[..n];
                     for i in 0..n {
                         out[i] = ((x[i] - mean) - rest) * scale * gain[i] + bias[i];
                     }
@@ -148,7 +203,7 @@ fn layer_norm_grad<T: Scalar>(
     scratch: &mut [T],
 ) {
     let n = gain.len();
-    let (eps, count) = (T::from_f64(eps), T::from_f64(n as f64));
+    let (count, mut space) = (T::from_f64(n as f64), vec![]);
     for ((x, g), dx) in x.chunks(GROUP * n).zip(g.chunks(GROUP * n)).zip(dx.chunks_mut(GROUP * n)) {
         simd::dispatch(
             #[inline(always)]
@@ -157,8 +212,8 @@ fn layer_norm_grad<T: Scalar>(
                 group.fill(T::ZERO);
                 let gain = &gain[..n];
                 for ((x, g), dx) in x.chunks_exact(n).zip(g.chunks_exact(n)).zip(dx.chunks_exact_mut(n)) {
-                    let ([mean, rest], variance) = moments(x);
-                    let scale = T::ONE / (variance + eps).sqrt();
+                    let (x, Standard { mean: [mean, rest], scale, down }) = standard(x, eps, &mut space);
+                    let x = &x[..n];
                     for i in 0..n {
                         unit[i] = ((x[i] - mean) - rest) * scale;
                         dx[i] = g[i] * gain[i];
@@ -178,7 +233,7 @@ fn layer_norm_grad<T: Scalar>(
                     );
                     let (level, slope) = (level / count, slope / count);
                     for i in 0..n {
-                        dx[i] = ((dx[i] - level) - unit[i] * slope) * scale;
+                        dx[i] = ((dx[i] - level) - unit[i] * slope) * scale * down;
                     }
                 }
                 for (sum, &part) in sums.iter_mut().zip(&*group) {
@@ -197,7 +252,7 @@ mod tests {
     #[test]
     fn layer_norm_rows_other_lengths_panic() {
         let pool = Pool::none();
-        assert_panics(|| variance_rows(&[0.0_f32; 7], 3, &mut [0.0; 2]), "7 numbers are not 2 rows of 3");
+        assert_panics(|| variance_rows(&[0.0_f32; 7], 3, 1.0, false, &mut [0.0; 2]), "7 numbers are not 2 rows of 3");
         let forward = |len: usize, n: usize| {
             layer_norm_rows(&vec![0.0; len], &vec![1.0; n], &vec![0.0; n], 1e-5, &mut [0.0_f32; 7])
         };
@@ -223,7 +278,7 @@ mod tests {
             let mean = x.iter().map(|&x| f64::from(x)).sum::<f64>() / n as f64;
             let exact = x.iter().map(|&x| (f64::from(x) - mean).powi(2)).sum::<f64>() / n as f64;
             let mut out = [0.0];
-            variance_rows(&x, n, &mut out);
+            variance_rows(&x, n, 1.0, false, &mut out);
             assert!((f64::from(out[0]) / exact - 1.0).abs() < 1e-5, "{n}: {} for {exact}", out[0]);
             // Normalised, the row has mean 0 and variance 1 to the last digits.
             let mut unit = vec![0.0; n];

@@ -102,7 +102,7 @@ fn norms<T: Scalar>() {
         let [wide_x, wide_gain, wide_bias, wide_g] = [&x, &gain, &bias, &g].map(|x| wide(x));
         let moments: Vec<_> = wide_x.chunks(n).map(moments).collect();
         let mut variances = nan::<T>(rows);
-        variance_rows(&x, n, &mut variances);
+        variance_rows(&x, n, T::ONE, false, &mut variances);
         // Of a row of one nothing but rounding is left.
         close(&what("variance"), &variances, 16.0, moments.iter().map(|[_, variance]| [*variance, *variance]));
         let mut y = nan::<T>(x.len());
@@ -159,7 +159,7 @@ fn narrow<T: Scalar>() {
         let offsets: Vec<f64> = (0..3 * n).map(|i| ((i * 7919 + i / 1013) % 11) as f64).collect();
         let x: Vec<T> = offsets.iter().map(|offset| T::from_f64(30_000.0 + offset * unit)).collect();
         let mut variances = nan::<T>(3);
-        variance_rows(&x, n, &mut variances);
+        variance_rows(&x, n, T::ONE, false, &mut variances);
         let exact = offsets.chunks(n).map(|row| moments(row)[1] * unit * unit);
         close(&format!("variance of {n} far from 0"), &variances, 256.0, exact.map(|variance| [variance, variance]));
     }
