@@ -103,14 +103,15 @@ pub fn extremum_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], [outer, count, inner]
         return;
     }
     let run = count * inner;
-    let mut shares = vec![T::ZERO; inner];
+    // Whole numbers: a sum of ones in f32 ends at 2^24.
+    let (mut counts, mut shares) = (vec![0_u32; inner], vec![T::ZERO; inner]);
     simd::dispatch(
         #[inline(always)]
         || {
-            let shares = &mut shares[..inner];
+            let (counts, shares) = (&mut counts[..inner], &mut shares[..inner]);
             let rows = x.chunks_exact(run).zip(out.chunks_exact_mut(run));
             for ((x, out), (y, g)) in rows.zip(y.chunks_exact(inner).zip(g.chunks_exact(inner))) {
-                // 1 where an element equals the result; their number goes to `shares`.
+                // 1 where an element equals the result.
                 if inner == 1 {
                     let mut number = 0.0;
                     for i in 0..count {
@@ -125,14 +126,14 @@ pub fn extremum_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], [outer, count, inner]
                     }
                     continue;
                 }
-                shares.fill(T::ZERO);
+                counts.fill(0);
                 for x in x.chunks_exact(inner) {
                     for i in 0..inner {
-                        shares[i] += if x[i] == y[i] { T::ONE } else { T::ZERO };
+                        counts[i] += u32::from(x[i] == y[i]);
                     }
                 }
                 for i in 0..inner {
-                    shares[i] = g[i] / shares[i];
+                    shares[i] = T::from_f64(g[i].to_f64() / f64::from(counts[i]));
                 }
                 for (x, out) in x.chunks_exact(inner).zip(out.chunks_exact_mut(inner)) {
                     for i in 0..inner {
@@ -201,6 +202,19 @@ mod tests {
                     }
                 }
             }
+        }
+    }
+
+    #[test]
+    #[ignore = "256 MB; run with cargo test --release -p raygrad-tensor ties -- --ignored"]
+    fn more_ties_than_f32_counts() {
+        let x = vec![0.0_f32; 3 << 24];
+        let mut dx = vec![1.0; x.len()];
+        for middle @ [_, _, inner] in [[1, 3 << 24, 1], [1, 3 << 23, 2]] {
+            let y = vec![0.0; inner];
+            extremum_grad(&x, &y, &vec![3.0; inner], middle, &mut dx);
+            let expected = 3.0 / (x.len() / inner) as f32;
+            assert!(dx.iter().all(|&dx| dx == expected), "{} for {expected}", dx[0]);
         }
     }
 

@@ -1,7 +1,7 @@
 //! The windows of a 2-D convolution or pooling. Kernels work on one image; a caller loops over a batch.
 
 use crate::parallel::{ELEMENT, chunks};
-use crate::{Scalar, checked_len, simd};
+use crate::{Scalar, add_assign, checked_len, simd};
 use std::ops::Range;
 
 /// The positions of the windows of one image. Window `(i, j)` starts at row `i * stride[0] - padding[0]` and column
@@ -84,16 +84,17 @@ impl Windows {
         first.min(end)..end
     }
 
-    /// Calls `f(k, windows, first)` for each element `k` of a window and each row of windows in `among`. It skips rows
+    /// Calls `f(k, windows, first)` for these elements `k` of a window and each row of windows in `among`. It skips rows
     /// in which `k` is outside the image for all windows. `windows` are the numbers of the other windows, counted from
     /// the first row of `among`. `first` is the position of element `k` of the first of them; the next one is
     /// `stride[1]` further.
     #[inline(always)]
-    fn runs(&self, among: Range<usize>, mut f: impl FnMut(usize, Range<usize>, usize)) {
-        for ki in 0..self.kernel[0] {
+    fn runs(&self, elements: Range<usize>, among: Range<usize>, mut f: impl FnMut(usize, Range<usize>, usize)) {
+        let width = self.kernel[1];
+        for ki in elements.start / width..elements.end.div_ceil(width) {
             let rows = self.inside(0, ki);
             let rows = rows.start.max(among.start)..rows.end.min(among.end);
-            for kj in 0..self.kernel[1] {
+            for kj in elements.start.saturating_sub(ki * width)..width.min(elements.end - ki * width) {
                 let columns = self.inside(1, kj);
                 if columns.is_empty() {
                     continue;
@@ -154,7 +155,7 @@ impl Windows {
                 out.fill(T::ZERO);
             }
             let image = &image[channel * pixels..][..pixels];
-            self.runs(rows.clone(), |k, windows, first| {
+            self.runs(0..self.kernel_len(), rows.clone(), |k, windows, first| {
                 let out = &mut out[k * count..][windows];
                 if step == 1 {
                     out.copy_from_slice(&image[first..first + out.len()]);
@@ -179,6 +180,7 @@ impl Windows {
         chunks(image, self.pixels().max(1), work, || (), &|_, channel, image| {
             let columns = &columns[channel * per_channel..][..per_channel];
             self.add_runs(
+                0..self.kernel_len(),
                 image,
                 #[inline(always)]
                 |k, windows| &columns[k * count..][windows],
@@ -186,14 +188,20 @@ impl Windows {
         });
     }
 
-    /// Adds `values(k, windows)` to the pixels that are element `k` of these windows.
+    /// Adds `values(k, windows)` to the pixels that are element `k` of these windows, for these `k`.
     #[inline(always)]
-    fn add_runs<'a, T: Scalar>(&self, image: &mut [T], values: impl Fn(usize, Range<usize>) -> &'a [T]) {
+    fn add_runs<'a, T: Scalar>(
+        &self,
+        elements: Range<usize>,
+        image: &mut [T],
+        values: impl Fn(usize, Range<usize>) -> &'a [T],
+    ) {
         let step = self.stride[1];
         simd::dispatch(
             #[inline(always)]
             || {
                 self.runs(
+                    elements,
                     0..self.output[0],
                     #[inline(always)]
                     |k, windows, first| {
@@ -214,10 +222,10 @@ impl Windows {
         );
     }
 
-    /// Folds the pixels of each window of one channel, in order: `f(.. f(f(start, x), x') ..)`.
+    /// Folds these elements of each window of one channel, in order: `f(.. f(f(start, x), x') ..)`.
     #[inline(always)]
     #[track_caller]
-    fn reduce<T: Scalar>(&self, plane: &[T], out: &mut [T], start: T, f: impl Fn(T, T) -> T) {
+    fn reduce<T: Scalar>(&self, elements: Range<usize>, plane: &[T], out: &mut [T], start: T, f: impl Fn(T, T) -> T) {
         self.check(plane.len(), out.len(), self.count());
         out.fill(start);
         let step = self.stride[1];
@@ -225,6 +233,7 @@ impl Windows {
             #[inline(always)]
             || {
                 self.runs(
+                    elements,
                     0..self.output[0],
                     #[inline(always)]
                     |_, windows, first| {
@@ -239,33 +248,46 @@ impl Windows {
         );
     }
 
-    /// The sum of each window of one channel `[height, width]`; padding counts as 0.
+    /// The sum of each window of one channel `[height, width]`; padding counts as 0. The sum is pairwise.
     ///
     /// # Panics
     /// If a slice has another length.
     #[track_caller]
     pub fn sums<T: Scalar>(&self, plane: &[T], out: &mut [T]) {
-        self.reduce(
-            plane,
-            out,
-            T::ZERO,
-            #[inline(always)]
-            |sum, x| sum + x,
-        );
+        in_pairs(0..self.kernel_len(), RUN, out, &|elements, out| {
+            self.reduce(
+                elements,
+                plane,
+                out,
+                T::ZERO,
+                #[inline(always)]
+                |sum, x| sum + x,
+            );
+        });
     }
 
-    /// Adds each value to every pixel of its window: the adjoint of [`sums`](Self::sums).
+    /// The largest number of windows that a pixel is in, if there are enough windows.
+    pub fn overlap(&self) -> usize {
+        (0..2).map(|axis| self.kernel[axis].div_ceil(self.stride[axis])).product()
+    }
+
+    /// Adds each value to every pixel of its window: the adjoint of [`sums`](Self::sums). The sum is pairwise.
     ///
     /// # Panics
     /// If a slice has another length.
     #[track_caller]
     pub fn spread<T: Scalar>(&self, values: &[T], plane: &mut [T]) {
         self.check(plane.len(), values.len(), self.count());
-        self.add_runs(
-            plane,
-            #[inline(always)]
-            |_, windows| &values[windows],
-        );
+        // A pixel is element `k` of a window for `overlap` of all `k`.
+        let run = RUN * (self.kernel_len() / self.overlap()).max(1);
+        in_pairs(0..self.kernel_len(), run, plane, &|elements, plane| {
+            self.add_runs(
+                elements,
+                plane,
+                #[inline(always)]
+                |_, windows| &values[windows],
+            );
+        });
     }
 
     /// The largest element of each window of one channel `[height, width]`, NaN if there is one; padding is ignored. A
@@ -276,6 +298,7 @@ impl Windows {
     #[track_caller]
     pub fn maxima<T: Scalar>(&self, plane: &[T], out: &mut [T]) {
         self.reduce(
+            0..self.kernel_len(),
             plane,
             out,
             T::from_f64(f64::NEG_INFINITY),
@@ -301,6 +324,7 @@ impl Windows {
             #[inline(always)]
             || {
                 self.runs(
+                    0..self.kernel_len(),
                     0..self.output[0],
                     #[inline(always)]
                     |_, windows, first| {
@@ -318,6 +342,22 @@ impl Windows {
         );
         assert!(!out.contains(&NONE), "a window of {self:?} sees no pixel");
     }
+}
+
+/// Elements of a window that are added one after another before pairs are formed.
+const RUN: usize = 32;
+
+/// A sum over `elements` in pairs of runs. `sum(elements, out)` adds a run to `out`, or to zeros in its place.
+#[track_caller]
+fn in_pairs<T: Scalar>(elements: Range<usize>, run: usize, out: &mut [T], sum: &impl Fn(Range<usize>, &mut [T])) {
+    if elements.len() <= run {
+        return sum(elements, out);
+    }
+    let middle = elements.start + (elements.len() / 2).next_multiple_of(run);
+    in_pairs(elements.start..middle, run, out, sum);
+    let mut rest = vec![T::ZERO; out.len()];
+    in_pairs(middle..elements.end, run, &mut rest, sum);
+    add_assign(out, &rest);
 }
 
 /// Whether `x` replaces the largest element so far. NaN does, and only another NaN replaces it.
@@ -344,7 +384,7 @@ mod tests {
     proptest! {
         #[test]
         fn every_walk_agrees_with_the_definition(
-            image in [0usize..7, 1usize..8], kernel in [1usize..4, 1usize..4], stride in [1usize..4, 1usize..4],
+            image in [0usize..9, 1usize..10], kernel in [1usize..8, 1usize..8], stride in [1usize..4, 1usize..4],
             padding in [0usize..3, 0usize..3], dilation in [1usize..3, 1usize..3], channels in 0usize..3
         ) {
             let Ok(w) = Windows::new(image, kernel, stride, padding, dilation) else { return Ok(()) };

@@ -23,7 +23,7 @@ pub const ROWS: Method = Method { names: ["gather_rows", "scatter_rows"], few_me
 pub const ENTRIES: Method = Method { names: ["index_select", "index_add"], few_meet: false };
 /// Elements: [`Var::gather`], [`Var::scatter_add`].
 pub const ELEMENTS: Method = Method { names: ["gather", "scatter_add"], few_meet: false };
-/// Pixels of planes, each the maximum of few windows: [`Var::max_pool2d`].
+/// Pixels of planes: [`Var::max_pool2d`], if a pixel is in few windows.
 pub const PIXELS: Method = Method { names: ["gather_planes", "scatter_planes"], few_meet: true };
 
 /// The indices along an axis.

@@ -1,6 +1,6 @@
 //! Max and average pooling of images `[n, channels, height, width]`. Channels run in parallel on rayon's threads.
 
-use super::pick::{PIXELS, Pick, Places, Put};
+use super::pick::{Method, PIXELS, Pick, Places, Put};
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::parallel::chunks;
 use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor, Windows};
@@ -72,6 +72,9 @@ pub struct AvgPool2dInput {
     pub image: [usize; 2],
 }
 
+/// Gradients of one pixel that are added in their own type.
+const FEW: usize = 16;
+
 /// The last two extents replaced.
 fn with_plane(shape: &[usize], plane: [usize; 2]) -> Shape {
     let mut out = Shape::from_slice(shape);
@@ -135,7 +138,8 @@ impl<T: Scalar> Op<T> for MaxPool2d {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let index = self.index(cx.x(0).value());
         let g = cx.g().reshape(index.shape());
-        let pick = Pick { method: PIXELS, axis: 1, places: Places::Elements(index) };
+        let method = Method { few_meet: self.0.accepted(cx.shape(0)).overlap() <= FEW, ..PIXELS };
+        let pick = Pick { method, axis: 1, places: Places::Elements(index) };
         let put = Put { pick, extent: plane_len(cx.shape(0)) };
         Grads::one(cx.tape().apply(put, &[&g]).reshape(cx.shape(0)))
     }
