@@ -17,6 +17,15 @@ fn kept_last() -> Axes {
     Axes::from(-1).keepdims()
 }
 
+/// `e^x g`, where the power may underflow if `g` brings it back into range.
+fn power_times<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
+    if g.value().iter().all(|g| g.abs() <= T::ONE) {
+        return x.exp() * g;
+    }
+    let root = (x * 0.5).exp();
+    &root * g * &root
+}
+
 /// A tensor of the shape of `x`, whose rows `kernel(x, row length, out)` writes.
 fn by_rows<T: Scalar>(x: &Tensor<T>, pool: &Pool<T>, kernel: impl FnOnce(&[T], usize, &mut [T])) -> Tensor<T> {
     let mut out = pool.tensor(x.shape());
@@ -84,7 +93,7 @@ impl<T: Scalar> Op<T> for LogSoftmax {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (y, g) = (cx.y(), cx.g());
         if cx.recording() {
-            return Grads::one(g - y.exp() * g.sum_over(kept_last()));
+            return Grads::one(g - power_times(&y, &g.sum_over(kept_last())));
         }
         let g = g.value().as_slice();
         Grads::one(cx.constant(by_rows(y.value(), cx.pool(), |y, n, out| rows::log_softmax_rows_grad(y, g, n, out))))
@@ -128,7 +137,7 @@ impl<T: Scalar> Op<T> for LogSumExp {
         // x - y would be NaN where both are -inf; there e^x is the 0 that is wanted.
         let nothing = y.elementwise_eq(f64::NEG_INFINITY);
         let y = y.constant(0.0).where_(&nothing, &y).reshape(&column);
-        Grads::one((x - y).exp() * cx.g().reshape(&column))
+        Grads::one(power_times(&(x - y), &cx.g().reshape(&column)))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {

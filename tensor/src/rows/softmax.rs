@@ -49,6 +49,37 @@ fn ln_total<T: Scalar>(powers: &[T]) -> T {
     (rest + (ones - T::ONE)).ln1p()
 }
 
+/// Whether `factor` times a power of a row may be in range although the power is not. `least` is the least element in
+/// range of a row of powers or of their logarithms.
+#[inline(always)]
+fn lifts<T: Scalar>(factor: T, row: &[T], least: [f64; 2]) -> bool {
+    if factor.abs() <= T::ONE {
+        return false;
+    }
+    let least = T::from_f64(least[usize::from(size_of::<T>() == 8)]);
+    let smallest = fold_lanes(
+        row,
+        #[inline(always)]
+        |a, b| if b < a { b } else { a },
+    );
+    smallest < least
+}
+
+/// `out = e^logarithm * factor`, where the power may underflow and the factor brings it back.
+#[cold]
+#[inline(never)]
+fn large_multiples<T: Scalar>(logarithms: &[T], factor: T, out: &mut [T]) {
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            for (out, &logarithm) in out.iter_mut().zip(logarithms) {
+                let root = (T::from_f64(0.5) * logarithm).exp();
+                *out = root * factor * root;
+            }
+        },
+    );
+}
+
 /// Softmax of each row of `n` elements: `e^(x - max) / sum e^(x - max)`.
 ///
 /// # Panics
@@ -153,12 +184,18 @@ pub fn log_softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T
         simd::dispatch(
             #[inline(always)]
             || {
-                out.copy_from_slice(&y[start..][..out.len()]);
+                let y = &y[start..][..out.len()];
+                out.copy_from_slice(y);
                 exponentials(out);
-                for (out, g) in out.chunks_exact_mut(n).zip(g.chunks_exact(n)) {
+                for ((out, y), g) in out.chunks_exact_mut(n).zip(y.chunks_exact(n)).zip(g.chunks_exact(n)) {
                     let sum = total(g);
+                    let mut factor = sum;
+                    if lifts(sum, y, [-87.0, -708.0]) {
+                        large_multiples(y, sum, out);
+                        factor = T::ONE;
+                    }
                     for i in 0..n {
-                        out[i] = g[i] - out[i] * sum;
+                        out[i] = g[i] - out[i] * factor;
                     }
                 }
             },
@@ -236,11 +273,21 @@ pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g:
         simd::dispatch(
             #[inline(always)]
             || {
-                for ((row, &class), &g) in out.chunks_exact_mut(n).zip(&classes[first..]).zip(&g[first..]) {
+                let rows = out.chunks_exact_mut(n).zip(x[start..].chunks_exact(n));
+                for (((row, x), &class), &g) in rows.zip(&classes[first..]).zip(&g[first..]) {
+                    let is_lifted = lifts(g, row, [f32::MIN_POSITIVE.into(), f64::MIN_POSITIVE]);
+                    if is_lifted {
+                        // The power of the greatest logit is 1.
+                        let (greatest, scale) = (top(x), top(row));
+                        let shifted: Vec<T> = x.iter().map(|&x| x - greatest).collect();
+                        large_multiples(&shifted, g * scale, row);
+                    }
                     row[class as usize] = T::ZERO;
                     row[class as usize] = -total(row);
-                    for out in row {
-                        *out *= g;
+                    if !is_lifted {
+                        for out in row {
+                            *out *= g;
+                        }
                     }
                 }
             },
