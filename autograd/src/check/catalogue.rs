@@ -208,6 +208,12 @@ fn reductions() -> Vec<Entry> {
             .sample_of(zeros(&[3, 4, 2], 5))
             .sample(&[&[2, 0]]),
         Entry::new(scan::Cumprod(walk(0, true))).sample(&[&[4]]).sample_of(zeros(&[5], 3)),
+        Entry::new(scan::CumprodGrad(walk(1, false)))
+            .sample(&[&[2, 4], &[2, 4]])
+            .sample_of(vec![zeros(&[3, 4], 2).remove(0), zeros(&[3, 4], 5).remove(0)])
+            .sample(&[&[2, 3, 2], &[2, 3, 2]])
+            .sample(&[&[2, 0], &[2, 0]]),
+        Entry::new(scan::CumprodGrad(walk(0, true))).sample(&[&[4], &[4]]),
         Entry::new(scan::Recurrence(walk(0, false))).sample(&[&[5], &[5]]).sample(&[&[4, 2], &[4, 2]]),
         Entry::new(scan::Recurrence(walk(1, true))).sample(&[&[2, 4], &[2, 4]]).sample(&[&[2, 0], &[2, 0]]),
         Entry::new(product::Product)
@@ -264,6 +270,8 @@ fn core() -> Vec<Entry> {
             .sample(&[&[0, 3], &[3, 4], &[4]]),
         Entry::new(reduce::SumTo { shape: shape(&[]) }).linear().sample(&[&[2, 3]]).sample(&[&[]]).sample(&[&[0, 2]]),
         Entry::new(reduce::SumTo { shape: shape(&[3, 1]) }).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
+        Entry::new(reduce::MeanTo { shape: shape(&[]) }).linear().sample(&[&[2, 3]]).sample(&[&[]]),
+        Entry::new(reduce::MeanTo { shape: shape(&[3, 1]) }).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
         Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]) }).linear().sample(&[&[3, 1]]).sample(&[&[]]),
         Entry::new(shape::Reshape { shape: shape(&[3, 2]) }).linear().sample(&[&[2, 3]]).sample(&[&[6]]),
         Entry::new(view(&[2, 3, 4], |layout| layout.permuted(&[2, 0, 1]))).linear().sample(&[&[2, 3, 4]]),

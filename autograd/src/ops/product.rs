@@ -2,6 +2,7 @@
 
 use super::scan::{Cumprod, Walk};
 use crate::{Axes, Grads, Op, ShapeError, Var, Vjp};
+use raygrad_tensor::scale::power_of_two;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
 /// y = the product of each row (along the last axis); dx = g times the product of all others.
@@ -140,19 +141,90 @@ fn split(x: f64) -> (f64, i64) {
     (f64::from_bits(bits & !MASK | 1023 << 52), (bits >> 52 & 0x7ff) as i64 - 1023 - lift)
 }
 
+/// A number `factor * 2^exponent` of any size. The exponent stays 0 as long as numbers are in the middle of f64's range.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Wide {
+    /// Between 2^-400 and 2^400, unless it is 0 or not finite.
+    factor: f64,
+    exponent: i64,
+}
+
+impl From<f64> for Wide {
+    #[inline(always)]
+    fn from(x: f64) -> Self {
+        Wide { factor: 1.0, exponent: 0 }.times(x)
+    }
+}
+
+impl Wide {
+    #[inline(always)]
+    fn is_in_the_middle(x: f64) -> bool {
+        const END: f64 = f64::from_bits((1023 + 400) << 52);
+        x.abs() > 1.0 / END && x.abs() < END
+    }
+
+    /// The product with a number.
+    #[inline(always)]
+    pub fn times(self, x: f64) -> Self {
+        let factor = self.factor * x;
+        if Wide::is_in_the_middle(factor) { Wide { factor, ..self } } else { self.times_any(x) }
+    }
+
+    #[inline(never)]
+    fn times_any(self, x: f64) -> Self {
+        if self.factor == 0.0 || x == 0.0 || !self.factor.is_finite() || !x.is_finite() {
+            return Wide { factor: self.factor * x, exponent: 0 };
+        }
+        let ((a, up), (b, up_too)) = (split(self.factor), split(x));
+        Wide { factor: a * b, exponent: self.exponent + up + up_too }
+    }
+
+    /// The product of two.
+    #[inline(always)]
+    pub fn product(self, other: Self) -> Self {
+        let product = self.times(other.factor);
+        Wide { exponent: product.exponent + other.exponent, ..product }
+    }
+
+    /// The sum.
+    #[inline(always)]
+    pub fn plus(self, other: Self) -> Self {
+        let factor = self.factor + other.factor;
+        if self.exponent == other.exponent && Wide::is_in_the_middle(factor) {
+            Wide { factor, ..self }
+        } else {
+            self.plus_any(other)
+        }
+    }
+
+    #[inline(never)]
+    fn plus_any(self, other: Self) -> Self {
+        let is_special = |x: Self| x.factor == 0.0 || !x.factor.is_finite();
+        match (is_special(self), is_special(other)) {
+            (true, true) => return Wide { factor: self.factor + other.factor, exponent: 0 },
+            (true, false) => return if self.factor == 0.0 { other } else { self },
+            (false, true) => return if other.factor == 0.0 { self } else { other },
+            (false, false) => {}
+        }
+        let [(a, up), (b, up_too)] = [self, other].map(|x| {
+            let (factor, exponent) = split(x.factor);
+            (factor, exponent + x.exponent)
+        });
+        let most = up.max(up_too);
+        let sum = a * power_of_two(up - most) + b * power_of_two(up_too - most);
+        Wide { factor: sum, exponent: most }
+    }
+
+    /// The number in f64.
+    #[inline(always)]
+    pub fn value(self) -> f64 {
+        if self.exponent == 0 { self.factor } else { scaled(self.factor, 1.0, self.exponent) }
+    }
+}
+
 /// Two numbers that differ by 1 at most and add up to `exponent`.
 fn halves(exponent: i64) -> [i64; 2] {
     [exponent / 2, exponent - exponent / 2]
-}
-
-/// `2^exponent`; 0 or infinity beyond the range of f64.
-fn power_of_two(exponent: i64) -> f64 {
-    match exponent {
-        ..-1074 => 0.0,
-        -1074..-1022 => f64::from_bits(1 << (exponent + 1074)),
-        -1022..1024 => f64::from_bits(((exponent + 1023) as u64) << 52),
-        _ => f64::INFINITY,
-    }
 }
 
 /// `product * g * 2^exponent`, for a product that is near 1, 0 or not finite.

@@ -1,7 +1,8 @@
 //! Cumulative sums and products, and the recurrence in their derivatives.
 
+use super::product::Wide;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, simd};
 use std::ops::Range;
 
 /// The order in which a scan walks an axis.
@@ -23,15 +24,15 @@ impl Walk {
     }
 
     /// Calls `f(state, i)` for every element in the order of the walk. Each line along the axis has one state, which
-    /// starts as `start`. States are f64, so they are not rounded to the type.
+    /// starts as `start`. States are wider than the type, so they are not rounded to it.
     #[inline(always)]
-    fn run(self, shape: &[usize], start: f64, mut f: impl FnMut(&mut f64, usize)) {
+    fn run<S: Copy>(self, shape: &[usize], start: S, mut f: impl FnMut(&mut S, usize)) {
         let (count, inner) = (shape[self.axis], shape[self.axis + 1..].iter().product::<usize>());
         let outer: usize = shape[..self.axis].iter().product();
         if inner == 1 {
             // Several lines side by side: in one, each entry waits for the entry before.
             const LINES: usize = 8;
-            let mut lines = |first: usize, states: &mut [f64]| {
+            let mut lines = |first: usize, states: &mut [S]| {
                 for step in 0..count {
                     let entry = if self.reverse { count - 1 - step } else { step };
                     for (k, state) in states.iter_mut().enumerate() {
@@ -68,12 +69,12 @@ impl Walk {
 /// Calls `f(state, i)` for every element of these ranges of rows, with `inner` elements in a row. It walks from the
 /// first row of a range to the last, or in `reverse`. Each column of a range has a state that starts as `start`.
 #[inline(always)]
-pub(super) fn walk_rows(
+pub(super) fn walk_rows<S: Copy>(
     ranges: impl Iterator<Item = Range<usize>>,
     inner: usize,
     reverse: bool,
-    start: f64,
-    mut f: impl FnMut(&mut f64, usize),
+    start: S,
+    mut f: impl FnMut(&mut S, usize),
 ) {
     let mut states = vec![start; inner];
     for rows in ranges {
@@ -87,7 +88,7 @@ pub(super) fn walk_rows(
     }
 }
 
-/// y = the sum of x up to and including each entry; dx = the sum of g the other way.
+/// y = the sum of x up to and including each entry, in twice the digits of f32 or f64; dx = the sum of g the other way.
 #[derive(Clone, Copy)]
 pub struct Cumsum(
     /// The order.
@@ -106,9 +107,21 @@ impl<T: Scalar> Op<T> for Cumsum {
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let mut out = pool.tensor(x[0].shape());
         let (x, y, shape) = (x[0].as_slice(), out.as_mut_slice(), x[0].shape());
-        self.0.run(shape, 0.0, |sum, i| {
-            *sum += x[i].to_f64();
-            y[i] = T::from_f64(*sum);
+        if T::EPSILON > 1e-10 {
+            // f64 is wide enough for sums of f32.
+            self.0.run(shape, 0.0, |sum, i| {
+                *sum += x[i].to_f64();
+                y[i] = T::from_f64(*sum);
+            });
+            return out;
+        }
+        self.0.run(shape, [0.0; 2], |state, i| {
+            let ([sum, rest], x) = (*state, x[i].to_f64());
+            let next = sum + x;
+            // What rounding takes from the sum is carried too.
+            let of_x = next - sum;
+            *state = [next, rest + ((sum - (next - of_x)) + (x - of_x))];
+            y[i] = T::from_f64(if next.is_finite() { next + state[1] } else { next });
         });
         out
     }
@@ -122,8 +135,141 @@ impl<T: Scalar> Op<T> for Cumsum {
     }
 }
 
-/// y = the product of x up to and including each entry. dx: [`Recurrence`] carries the gradients of all later products
-/// back, times the product before the entry. Nothing is divided, so zeros do no harm.
+/// A running product or sum of products.
+trait Running: Copy + From<f64> {
+    /// The product with a number.
+    fn times(self, x: f64) -> Self;
+    /// The product.
+    fn product(self, other: Self) -> Self;
+    /// The sum.
+    fn plus(self, other: Self) -> Self;
+    /// The number in f64.
+    fn value(self) -> f64;
+    /// Whether the number is right, if it is not 0.
+    fn is_in_range(self) -> bool;
+}
+
+impl Running for f64 {
+    #[inline(always)]
+    fn times(self, x: f64) -> f64 {
+        self * x
+    }
+    #[inline(always)]
+    fn product(self, other: f64) -> f64 {
+        self * other
+    }
+    #[inline(always)]
+    fn plus(self, other: f64) -> f64 {
+        self + other
+    }
+    #[inline(always)]
+    fn value(self) -> f64 {
+        self
+    }
+    #[inline(always)]
+    fn is_in_range(self) -> bool {
+        (1e-300..1e300).contains(&self.abs())
+    }
+}
+
+impl Running for Wide {
+    #[inline(always)]
+    fn times(self, x: f64) -> Self {
+        self.times(x)
+    }
+    #[inline(always)]
+    fn product(self, other: Self) -> Self {
+        self.product(other)
+    }
+    #[inline(always)]
+    fn plus(self, other: Self) -> Self {
+        self.plus(other)
+    }
+    #[inline(always)]
+    fn value(self) -> f64 {
+        self.value()
+    }
+    #[inline(always)]
+    fn is_in_range(self) -> bool {
+        true
+    }
+}
+
+impl Walk {
+    /// Whether no product of `x` comes back after it has left the range of f64.
+    fn stays_in_range<T: Scalar>(self, shape: &[usize], x: &[T]) -> bool {
+        // The order of positive numbers is that of their bits. Signed, which vectors compare.
+        let sizes = simd::dispatch(
+            #[inline(always)]
+            || {
+                const LANES: usize = 16;
+                let size = |x: T| (x.to_f64().to_bits() << 1 >> 1) as i64;
+                let (mut least, mut most) = ([i64::MAX; LANES], [0; LANES]);
+                let mut rows = x.chunks_exact(LANES);
+                for row in &mut rows {
+                    for i in 0..LANES {
+                        let size = size(row[i]);
+                        most[i] = if size > most[i] { size } else { most[i] };
+                        least[i] = if size < least[i] && size > 0 { size } else { least[i] };
+                    }
+                }
+                for &x in rows.remainder() {
+                    most[0] = most[0].max(size(x));
+                    least[0] = if size(x) == 0 { least[0] } else { least[0].min(size(x)) };
+                }
+                let most = most.into_iter().fold(0, i64::max);
+                [least.into_iter().fold(most, i64::min), most]
+            },
+        );
+        let [least, most] = sizes.map(|bits| f64::from_bits(bits as u64));
+        // A product that only falls stays too small.
+        most <= 1.0 || shape[self.axis] as f64 * most.log2().abs().max(least.log2().abs()) < 700.0
+    }
+
+    /// The product of `x` up to each entry, in `y`. Whether all are right, if it is `CHECKED`.
+    fn products<const CHECKED: bool, S: Running, T: Scalar>(self, shape: &[usize], x: &[T], y: &mut [T]) -> bool {
+        let mut are_right = true;
+        self.run(shape, S::from(1.0), |product, i| {
+            let x = x[i].to_f64();
+            let is_zero = !CHECKED || x == 0.0 || product.value() == 0.0;
+            *product = product.times(x);
+            are_right &= is_zero || product.is_in_range();
+            y[i] = T::from_f64(product.value());
+        });
+        are_right
+    }
+
+    /// The gradient of [`products`](Self::products), in `dx`. Whether all are right, if it is `CHECKED`.
+    fn products_grad<const CHECKED: bool, S: Running, T: Scalar>(
+        self,
+        shape: &[usize],
+        x: &[T],
+        g: &[T],
+        dx: &mut [T],
+    ) -> bool {
+        let (mut later, mut are_right) = (vec![S::from(0.0); x.len()], true);
+        // The gradient of the product up to entry i, times the factor there.
+        self.back().run(shape, S::from(0.0), |sum, i| {
+            let (x, g) = (x[i].to_f64(), g[i].to_f64());
+            later[i] = sum.plus(S::from(g));
+            are_right &= !CHECKED || (g == 0.0 && sum.value() == 0.0) || later[i].is_in_range();
+            let is_zero = !CHECKED || x == 0.0 || later[i].value() == 0.0;
+            *sum = later[i].times(x);
+            are_right &= is_zero || sum.is_in_range();
+        });
+        self.run(shape, S::from(1.0), |product, i| {
+            let x = x[i].to_f64();
+            dx[i] = T::from_f64(product.product(later[i]).value());
+            let is_zero = !CHECKED || x == 0.0 || product.value() == 0.0;
+            *product = product.times(x);
+            are_right &= is_zero || product.is_in_range();
+        });
+        are_right
+    }
+}
+
+/// y = the product of x up to and including each entry; dx = [`CumprodGrad`] of x and g. Products are in f64, or in
+/// [`Wide`] numbers if they leave its range: those in the range of the type are right even if others are not.
 #[derive(Clone, Copy)]
 pub struct Cumprod(
     /// The order.
@@ -142,21 +288,68 @@ impl<T: Scalar> Op<T> for Cumprod {
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let mut out = pool.tensor(x[0].shape());
         let (x, y, shape) = (x[0].as_slice(), out.as_mut_slice(), x[0].shape());
-        self.0.run(shape, 1.0, |product, i| {
-            *product *= x[i].to_f64();
-            y[i] = T::from_f64(*product);
-        });
+        if self.0.stays_in_range(shape, x) {
+            self.0.products::<false, f64, T>(shape, x, y);
+        } else if !self.0.products::<true, f64, T>(shape, x, y) {
+            self.0.products::<false, Wide, T>(shape, x, y);
+        }
         out
     }
 
     fn reads(&self) -> Reads {
-        Reads::ALL
+        Reads::INPUTS
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let next = self.0.neighbour(&cx.x(0), true, 0.0);
-        let later = cx.tape().apply(Recurrence(self.0.back()), &[&next, cx.g()]);
-        Grads::one(later * self.0.neighbour(&cx.y(), false, 1.0))
+        Grads::one(cx.tape().apply(CumprodGrad(self.0), &[&cx.x(0), cx.g()]))
+    }
+}
+
+/// The gradient of [`Cumprod`] from x and g: the gradients of all later products, carried back, times the product before
+/// the entry. Nothing is divided, so zeros do no harm. Its gradients: the tangent t of the products along g, and that of
+/// the recurrence t[i] = x[i] t[i - 1] + g[i] y[i - 1].
+#[derive(Clone, Copy)]
+pub struct CumprodGrad(
+    /// The order of the products.
+    pub Walk,
+);
+
+impl<T: Scalar> Op<T> for CumprodGrad {
+    fn name(&self) -> &'static str {
+        "cumprod_grad"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[0] != x[1] {
+            return Err("factors and gradients must have one shape".into());
+        }
+        self.0.check(x[0])
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(x[0].shape());
+        let (x, g, dx, shape) = (x[0].as_slice(), x[1].as_slice(), out.as_mut_slice(), x[0].shape());
+        // Gradients in f64 may bring back products that have fallen out of its range; those in f32 may not.
+        if T::EPSILON > 1e-10 && self.0.stays_in_range(shape, x) {
+            self.0.products_grad::<false, f64, T>(shape, x, g, dx);
+        } else if !self.0.products_grad::<true, f64, T>(shape, x, g, dx) {
+            self.0.products_grad::<false, Wide, T>(shape, x, g, dx);
+        }
+        out
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (walk, tape, x, h) = (self.0, cx.tape(), cx.x(0), cx.g());
+        let back = Recurrence(walk.back());
+        let before = walk.neighbour(&tape.apply(Cumprod(walk), &[&x]), false, 1.0);
+        let tangent = tape.apply(Recurrence(walk), &[&x, &(h * &before)]);
+        let dx = cx.needs(0).then(|| {
+            let next = walk.neighbour(&x, true, 0.0);
+            let later = tape.apply(back, &[&next, &cx.x(1)]);
+            let of_products = tape.apply(back, &[&next, &walk.neighbour(&(h * &later), true, 0.0)]);
+            later * walk.neighbour(&tangent, false, 0.0) + of_products * before
+        });
+        Grads::new([dx, Some(tangent)])
     }
 }
 
@@ -213,7 +406,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().as_one(|| scan(walk, self))
     }
 
-    /// The cumulative sum along `axis`, with the running sum in f64. Each sum includes its own entry.
+    /// The cumulative sum along `axis`, rounded once. Each sum includes its own entry.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -222,8 +415,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.walk("cumsum", axis, false, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
     }
 
-    /// The cumulative sum along `axis` from the last entry back, with the running sum in f64. Each sum includes its own
-    /// entry.
+    /// The cumulative sum along `axis` from the last entry back, rounded once. Each sum includes its own entry.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -232,8 +424,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.walk("reverse_cumsum", axis, true, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
     }
 
-    /// The cumulative product along `axis`, with the running product in f64. Each product includes its own entry. The
-    /// gradient is right even if entries are 0.
+    /// The cumulative product along `axis`, rounded once. Each product includes its own entry. Products and gradients are
+    /// right even if entries are 0, or other products are out of the type's range.
     ///
     /// # Panics
     /// If the axis does not exist.
