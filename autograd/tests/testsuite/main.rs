@@ -7,5 +7,6 @@ mod harness;
 mod one_way;
 mod peers;
 mod random_graphs;
+mod range;
 mod reductions;
 mod scans;

@@ -1,0 +1,552 @@
+//! Reductions, norms and normalisations of numbers of every binade: against an exact oracle, under exact scaling, and in
+//! their second derivatives.
+
+use proptest::prelude::*;
+use raygrad_autograd::{Axes, Pool2dConfig, Scalar, Tape, Tensor, Var};
+use std::ops::{Add, Mul, Sub};
+
+/// A sum of two f64 that do not overlap: about 106 bits.
+#[derive(Debug, Clone, Copy)]
+struct Double(f64, f64);
+
+impl Double {
+    fn of_sum(a: f64, b: f64) -> Self {
+        let sum = a + b;
+        let of_b = sum - a;
+        Double(sum, (a - (sum - of_b)) + (b - of_b))
+    }
+    fn over(self, other: f64) -> Self {
+        let first = self.0 / other;
+        let rest = self - Double(first, 0.0) * Double(other, 0.0);
+        Double::of_sum(first, (rest.0 + rest.1) / other)
+    }
+    fn sqrt(self) -> Self {
+        if self.0 == 0.0 {
+            return self;
+        }
+        let root = self.0.sqrt();
+        let rest = self - Double(root, 0.0) * Double(root, 0.0);
+        Double::of_sum(root, 0.5 * (rest.0 + rest.1) / root)
+    }
+}
+
+impl Add for Double {
+    type Output = Self;
+    fn add(self, other: Self) -> Self {
+        let Double(sum, rest) = Double::of_sum(self.0, other.0);
+        Double::of_sum(sum, rest + (self.1 + other.1))
+    }
+}
+
+impl Sub for Double {
+    type Output = Self;
+    fn sub(self, other: Self) -> Self {
+        self + Double(-other.0, -other.1)
+    }
+}
+
+impl Mul for Double {
+    type Output = Self;
+    fn mul(self, other: Self) -> Self {
+        let product = self.0 * other.0;
+        let rest = f64::mul_add(self.0, other.0, -product);
+        Double::of_sum(product, rest + (self.0 * other.1 + self.1 * other.0))
+    }
+}
+
+fn sum(x: impl IntoIterator<Item = f64>) -> Double {
+    x.into_iter().fold(Double(0.0, 0.0), |sum, x| sum + Double(x, 0.0))
+}
+
+fn deviations(x: &[f64]) -> Vec<Double> {
+    let mean = sum(x.iter().copied()).over(x.len() as f64);
+    x.iter().map(|&x| Double(x, 0.0) - mean).collect()
+}
+
+fn norm(x: impl IntoIterator<Item = Double>) -> Double {
+    x.into_iter().fold(Double(0.0, 0.0), |sum, x| sum + x * x).sqrt()
+}
+
+/// `2^exponent` in two factors, since it may be out of range where a product with it is not.
+fn lifted(x: f64, exponent: i32) -> f64 {
+    x * 2.0_f64.powi(exponent / 2) * 2.0_f64.powi(exponent - exponent / 2)
+}
+
+/// The exponents of the normal numbers.
+fn exponents<T: Scalar>() -> [i32; 2] {
+    if T::NAME == "f32" { [-126, 127] } else { [-1022, 1023] }
+}
+
+/// Numbers of which the largest is in 1..2: rows of one size, of some sizes, of all, and with zeros.
+fn row(most: usize) -> impl Strategy<Value = Vec<f64>> {
+    let spread = prop_oneof![Just(0_i32), Just(3), Just(30), Just(2200)];
+    (spread, 1..most).prop_flat_map(|(spread, n)| {
+        let one = (any::<u64>(), 0..=spread, 0..8_u8).prop_map(move |(bits, below, kind)| {
+            let significand = f64::from_bits(bits >> 12 | 1023 << 52);
+            match kind {
+                0 if spread > 0 => 0.0,
+                1 => 1.0,
+                kind => lifted(significand, -below) * if kind % 2 == 0 { 1.0 } else { -1.0 },
+            }
+        });
+        prop::collection::vec(one, n).prop_map(|row| {
+            let largest = row.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
+            let power = if largest == 0.0 { 0 } else { largest.log2().floor() as i32 };
+            row.iter().map(|&x| lifted(x, -power)).collect()
+        })
+    })
+}
+
+/// The row at a place of the type's range, from its lower end at 0 to its upper end at 1, rounded to the type.
+fn placed<T: Scalar>(row: &[f64], place: f64) -> (Vec<f64>, i32) {
+    let [low, high] = exponents::<T>();
+    let exponent = low + (place * f64::from(high - low)) as i32;
+    // In units of the place, in f64.
+    let round = |x: &f64| lifted(T::from_f64(lifted(*x, exponent)).to_f64(), -exponent);
+    (row.iter().map(round).collect(), exponent)
+}
+
+fn tensor<T: Scalar>(row: &[f64], exponent: i32) -> Tensor<T> {
+    Tensor::from_fn(&[row.len()], |i| T::from_f64(lifted(row[i], exponent)))
+}
+
+/// Fails if `got` is further than `units` units in the last place from `exact 2^exponent`, or than one subnormal step.
+fn check<T: Scalar>(what: &str, got: T, exact: Double, exponent: i32, units: f64) -> Result<(), TestCaseError> {
+    let [low, high] = exponents::<T>();
+    let size = exact.0.abs().log2() + f64::from(exponent);
+    let got = got.to_f64();
+    if exact.0 == 0.0 || size < f64::from(low) + 1.0 {
+        // Below the normal numbers: as many subnormal steps.
+        let step = T::EPSILON * 2.0_f64.powi(low);
+        let expected = lifted(exact.0, exponent);
+        prop_assert!((got - expected).abs() <= units * step, "{what} in {}: {got:e} for {expected:e}", T::NAME);
+    } else if size < f64::from(high) {
+        let error = (Double(lifted(got, -exponent), 0.0) - exact).0.abs() / exact.0.abs() / T::EPSILON;
+        prop_assert!(
+            error <= units,
+            "{what} in {}: {got:e} for {:e} 2^{exponent}, {error} units off",
+            T::NAME,
+            exact.0
+        );
+    }
+    Ok(())
+}
+
+/// The row as the last axis, as the first one, transposed, every second element, reversed, and broadcast: each along its
+/// axis.
+fn views<'t, T: Scalar>(x: &Var<'t, T>) -> Vec<(&'static str, Var<'t, T>, isize)> {
+    let n = x.shape()[0];
+    let column = x.reshape(&[n, 1]).broadcast_to(&[n, 3]);
+    let twice = Var::stack(&[x, x], 1);
+    let copied = x.tape().constant(Tensor::zeros(&[n, 3])) + &column;
+    vec![
+        ("the row", x.clone(), 0),
+        ("rows", x.reshape(&[1, n]).broadcast_to(&[2, n]) * 1.0, 1),
+        ("broadcast columns", column.clone(), 0),
+        ("columns", copied.clone(), 0),
+        ("transposed columns", copied.t(), 1),
+        ("every second element", twice.slice_axis(1, ..1).squeeze(-1), 0),
+        ("reversed columns", copied.flip(0), 0),
+    ]
+}
+
+/// Value and gradient of `std`, `norm`, `var`, `mean` and `normalize` of a row.
+fn reductions<T: Scalar>(row: &[f64], place: f64) -> Result<(), TestCaseError> {
+    let (row, exponent) = placed::<T>(row, place);
+    let n = row.len() as f64;
+    let tape = Tape::<T>::new();
+    let x = tape.leaf(tensor(&row, exponent));
+    let (apart, mean) = (deviations(&row), sum(row.iter().copied()).over(n));
+    let (length, away) = (norm(row.iter().map(|&x| Double(x, 0.0))), norm(apart.iter().copied()));
+    let deviation = (away * away).over(n).sqrt();
+    let magnitudes: f64 = row.iter().map(|x| x.abs()).sum();
+    // Digits of deviations that the mean's own rounding leaves.
+    let largest = row.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
+    for (name, x, axis) in views(&x) {
+        let what = |of: &str| format!("{of} of {name} of {n}");
+        for &y in x.norm_over(axis).value().as_slice() {
+            check(&what("norm"), y, length, exponent, 4.0)?;
+        }
+        for &y in x.std_over(axis, 0).value().as_slice() {
+            check(&what("std"), y, deviation, exponent, 8.0)?;
+        }
+        for &y in x.var_over(axis, 0).value().as_slice() {
+            check(&what("var"), y, deviation * deviation, 2 * exponent, 16.0)?;
+        }
+        // In units of the elements' mean size, in which a mean may vanish.
+        let scale = (magnitudes / n).max(1e-300);
+        for &y in x.mean_over(axis).value().as_slice() {
+            let [low, _] = exponents::<T>();
+            let bound = 16.0 * (T::EPSILON * scale).max(lifted(T::EPSILON, low - exponent));
+            let error = (Double(lifted(y.to_f64(), -exponent), 0.0) - mean).0.abs();
+            prop_assert!(error <= bound, "{}: {y:e} for {mean:?} 2^{exponent}", what("mean"), y = y.to_f64());
+        }
+        // Gradients of order 1, whatever the size of the row.
+        let gradient = |y: Var<'_, T>| y.sum().grad(&[&x]).remove(0).to_vec();
+        let along = |i: usize| if x.shape().len() == 1 || axis == 1 { i % row.len() } else { i / x.shape()[1] };
+        let flipped = name.starts_with("reversed");
+        let index = |i: usize| if flipped { row.len() - 1 - along(i) } else { along(i) };
+        // A size of subnormal numbers has few digits, and so have quotients by it.
+        let [low, _] = exponents::<T>();
+        let digits = |size: Double| lifted(T::EPSILON, low - exponent) / size.0 / T::EPSILON;
+        let is_in_range = T::from_f64(lifted(length.0, exponent)).is_finite();
+        if length.0 > 0.0 && digits(length) < 1e3 && is_in_range {
+            for (i, dx) in gradient(x.norm_over(axis)).into_iter().enumerate() {
+                let exact = Double(row[index(i)], 0.0).over(length.0);
+                check(&what("gradient of norm"), dx, exact, 0, 8.0 + 2.0 * digits(length))?;
+            }
+        }
+        if deviation.0 > 16.0 * T::EPSILON * largest && digits(deviation) < 1e3 {
+            for (i, dx) in gradient(x.std_over(axis, 0)).into_iter().enumerate() {
+                let exact = apart[index(i)].over(deviation.0).over(n);
+                // Deviations are exact to the digits of the mean.
+                let error = (dx.to_f64() - exact.0).abs();
+                let bound = 16.0 * T::EPSILON * (1.0 + largest / deviation.0 + digits(deviation)) / n;
+                prop_assert!(error <= bound, "{}: {:e} for {:e}", what("gradient of std"), dx.to_f64(), exact.0);
+            }
+        }
+    }
+    for (i, &y) in x.normalize().value().as_slice().iter().enumerate() {
+        let exact = if length.0 == 0.0 { Double(0.0, 0.0) } else { Double(row[i], 0.0).over(length.0) };
+        check("normalize", y, exact, 0, 6.0)?;
+    }
+    Ok(())
+}
+
+/// Layer normalisation, with an epsilon between 2^-40 and 2^40 variances, or 0.
+fn layer_norms<T: Scalar>(row: &[f64], place: f64, epsilon: Option<i32>) -> Result<(), TestCaseError> {
+    let (row, exponent) = placed::<T>(row, place);
+    let n = row.len();
+    let (apart, largest) = (deviations(&row), row.iter().fold(0.0, |most: f64, x| most.max(x.abs())));
+    let away = norm(apart.iter().copied());
+    let variance = (away * away).over(n as f64);
+    // An epsilon is an f64, and may be out of the range of f32.
+    let eps = epsilon.map_or(0.0, |power| lifted(1.0, 2 * exponent + power));
+    let in_units = epsilon.filter(|_| eps.is_normal()).map_or(0.0, |power| 2.0_f64.powi(power));
+    if variance.0 <= (16.0 * T::EPSILON * largest).powi(2) || (eps == 0.0) != (in_units == 0.0) {
+        return Ok(());
+    }
+    let scale = (variance + Double(in_units, 0.0)).sqrt();
+    let tape = Tape::<T>::new();
+    let x = tape.leaf(tensor(&row, exponent).reshape(&[1, n]));
+    let (gain, bias) = (tape.constant(Tensor::ones(&[n])), tape.constant(Tensor::zeros(&[n])));
+    let y = x.layer_norm(&gain, &bias, eps);
+    let relative = T::EPSILON * (1.0 + largest / away.0);
+    for (&y, exact) in y.value().as_slice().iter().zip(&apart) {
+        let (exact, bound) = (exact.over(scale.0).0, 64.0 * relative * away.0 / scale.0);
+        prop_assert!((y.to_f64() - exact).abs() <= bound, "layer_norm at 2^{exponent}: {:e} for {exact:e}", y.to_f64());
+    }
+    // Weighted by 1 for the first element: (1 - 1/n - u^2 / n) / scale.
+    let pick = |i: usize| if i == 0 { T::ONE } else { T::ZERO };
+    let weighted = (y * tape.constant(Tensor::from_fn(&[1, n], pick))).sum();
+    let first = (1.0 - (1.0 + (apart[0].0 / scale.0).powi(2)) / n as f64) / scale.0;
+    let [_, high] = exponents::<T>();
+    if (first.abs().log2() - f64::from(exponent)).abs() < f64::from(high) && first.abs() > 0.1 / scale.0 {
+        for grad in [weighted.grad(&[&x]).remove(0), weighted.grad_graph(&[&x]).remove(0).into_value()] {
+            let error = (lifted(grad.as_slice()[0].to_f64(), exponent) / first - 1.0).abs();
+            prop_assert!(error <= 256.0 * relative, "gradient of layer_norm at 2^{exponent}: {error:e} off");
+        }
+    }
+    Ok(())
+}
+
+type Function<T> = for<'t> fn(&Var<'t, T>) -> Var<'t, T>;
+
+/// Functions, with the power of a factor of their argument that their value has.
+fn scaled<T: Scalar>() -> [(&'static str, Function<T>, i32); 10] {
+    [
+        ("sum", |x| x.sum_over(-1), 1),
+        ("mean", |x| x.mean_over(-1), 1),
+        ("cumsum", |x| x.cumsum(-1), 1),
+        ("norm_l1", |x| x.norm_l1_over(-1), 1),
+        ("norm", |x| x.norm_over(-1), 1),
+        ("std", |x| x.std_over(-1, 0), 1),
+        (
+            "std along the first axis",
+            |x| x.reshape(&[x.shape()[0], 1]).broadcast_to(&[x.shape()[0], 2]).std_over(0, 0),
+            1,
+        ),
+        ("var", |x| x.var_over(-1, 0), 2),
+        ("normalize", |x| x.normalize(), 0),
+        (
+            "layer_norm",
+            |x| {
+                let like = |value| x.tape().constant(Tensor::full(x.shape(), value));
+                x.layer_norm(&like(T::ONE), &like(T::ZERO), 0.0)
+            },
+            0,
+        ),
+    ]
+}
+
+/// Value, gradient, recorded gradient, and the gradient of a weighted sum of that, with the power of each.
+fn of_all_orders<T: Scalar>(f: Function<T>, power: i32, x: &Tensor<T>) -> [(Vec<T>, i32); 4] {
+    let tape = Tape::<T>::new();
+    let weights = |n: usize, phase: f64| {
+        tape.constant(Tensor::from_fn(&[n], |i| T::from_f64((i as f64 * 0.7 + phase).sin() + 0.1)))
+    };
+    let x = tape.leaf(x.clone());
+    let y = f(&x);
+    let whole = y.reshape(&[y.value().len()]).dot(weights(y.value().len(), 0.3));
+    let plain = whole.grad(&[&x]).remove(0);
+    let recorded = whole.grad_graph(&[&x]).remove(0);
+    let second = recorded.dot(weights(x.value().len(), 1.1)).tracked().grad(&[&x]).remove(0);
+    [
+        (y.value().to_vec(), power),
+        (plain.to_vec(), power - 1),
+        (recorded.value().to_vec(), power - 1),
+        (second.to_vec(), power - 2),
+    ]
+}
+
+/// Numbers times a power of two give the results times its powers, bit for bit.
+fn scaling<T: Scalar>(row: &[f64], place: f64) -> Result<(), TestCaseError> {
+    let [low, high] = exponents::<T>();
+    // Digits of elements stay in range, down to their last bit.
+    let exponent = (f64::from(low + 100) + place * f64::from(high - low - 110)) as i32;
+    let row: Vec<f64> = row.iter().map(|x| T::from_f64(*x).to_f64()).collect();
+    let [near, far] = [0, exponent].map(|exponent| tensor::<T>(&row, exponent));
+    for (name, f, power) in scaled::<T>() {
+        let orders = of_all_orders(f, power, &near).into_iter().zip(of_all_orders(f, power, &far));
+        for (order, ((near, power), (far, _))) in orders.enumerate() {
+            for (&near, &far) in near.iter().zip(&far) {
+                let expected = T::from_f64(lifted(near.to_f64(), power * exponent)).to_f64();
+                let size = expected.abs();
+                // Where the result is normal, with a margin for the terms of derivatives.
+                let margin = if order == 0 { 1.0 } else { 2.0_f64.powi(30) };
+                if near.to_f64() == 0.0 || (lifted(margin, low)..lifted(1.0 / margin, high)).contains(&size) {
+                    prop_assert_eq!(
+                        far.to_f64(),
+                        expected,
+                        "{} in {} at 2^{}, order {}, of {:?}",
+                        name,
+                        T::NAME,
+                        exponent,
+                        order,
+                        row
+                    );
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Sums of every kind stay within the pairwise bound of the exact sum.
+fn sums<T: Scalar>(row: &[f64], repeats: usize, place: f64) -> Result<(), TestCaseError> {
+    let (row, exponent) = placed::<T>(row, 0.9 * place);
+    let row: Vec<f64> = row.iter().cycle().take(row.len() * repeats).copied().collect();
+    let n = row.len();
+    let exact = sum(row.iter().copied());
+    let [low, _] = exponents::<T>();
+    let rounds = 16.0 + (n as f64 / 512.0).log2().max(0.0);
+    let step = lifted(T::EPSILON, low - exponent);
+    let bound = rounds * (T::EPSILON * row.iter().map(|x| x.abs()).sum::<f64>()).max(step);
+    let tape = Tape::<T>::new();
+    let x = tape.constant(tensor(&row, exponent));
+    let within = |what: &str, got: T, bound: f64| {
+        let error = (Double(lifted(got.to_f64(), -exponent), 0.0) - exact).0.abs();
+        prop_assert!(error <= bound, "{what} of {n} in {}: {error:e} off, bound {bound:e}", T::NAME);
+        Ok(())
+    };
+    for (name, x, axis) in views(&x) {
+        for &y in x.sum_over(axis).value().as_slice() {
+            within(&format!("sum of {name}"), y, bound)?;
+        }
+    }
+    within("dot", x.dot(Tensor::ones(&[n])).item(), bound)?;
+    within("cumsum", x.cumsum(0).value().as_slice()[n - 1], bound)?;
+    // A window that is the image: its mean, and the gradients of as many windows in one pixel.
+    let image = x.reshape(&[1, 1, 1, n]);
+    let mean = image.avg_pool2d(&Pool2dConfig::new([1, n])).item();
+    within("avg_pool2d", T::from_f64(mean.to_f64() * n as f64), bound + T::EPSILON * exact.0.abs())?;
+    if n < 300 {
+        let pixels = tape.leaf(Tensor::from_fn(&[1, 1, 1, 2 * n - 1], |i| if i == n - 1 { T::ONE } else { T::ZERO }));
+        let config = Pool2dConfig { stride: [1, 1], ..Pool2dConfig::new([1, n]) };
+        let max = (pixels.max_pool2d(&config) * &image).sum().grad(&[&pixels]).remove(0);
+        within("gradient of max_pool2d", max.as_slice()[n - 1], bound)?;
+        let average = (pixels.avg_pool2d(&config) * &image).sum().grad(&[&pixels]).remove(0);
+        let mean = average.as_slice()[n - 1].to_f64() * n as f64;
+        within("gradient of avg_pool2d", T::from_f64(mean), bound + T::EPSILON * exact.0.abs())?;
+    }
+    Ok(())
+}
+
+/// Gradients that bring back the probabilities that underflow: e^x alone is out of range, its product with g is not.
+fn lifted_probabilities<T: Scalar>(row: &[f64], lift: f64) -> Result<(), TestCaseError> {
+    let [low, high] = exponents::<T>();
+    let reach = -f64::from(low) * std::f64::consts::LN_2;
+    // Logits down to below the range of e^x, rounded to halves, so that differences are exact.
+    let logits: Vec<f64> =
+        [0.0].into_iter().chain(row.iter().map(|x| (2.6 * x.abs().fract() * -reach).round() / 2.0)).collect();
+    let g = (lift * f64::from(high) * std::f64::consts::LN_2).exp();
+    let g = T::from_f64(g).to_f64();
+    let n = logits.len();
+    let total = sum(logits.iter().map(|x| x.exp())).0;
+    // In two factors, of which none underflows in f64.
+    let exact = |i: usize| (0.5 * logits[i]).exp() * g * (0.5 * logits[i]).exp() / total;
+    let tape = Tape::<T>::new();
+    let x = tape.leaf(Tensor::from_fn(&[1, n], |i| T::from_f64(logits[i])));
+    let first = |value: f64| tape.constant(Tensor::from_fn(&[1, n], |i| T::from_f64(if i == 0 { value } else { 0.0 })));
+    let results = [
+        ("logsumexp", (x.logsumexp_over(-1) * g).sum(), 1.0),
+        ("cross_entropy", (x.cross_entropy([0]) * g).sum(), 1.0),
+        ("log_softmax", (x.log_softmax(-1) * first(g)).sum(), -1.0),
+    ];
+    for (name, y, sign) in results {
+        for grad in [y.grad(&[&x]).remove(0), y.grad_graph(&[&x]).remove(0).into_value()] {
+            for (i, got) in grad.as_slice().iter().enumerate().skip(1) {
+                // The logarithm of the total is rounded in y, and e^x takes that on.
+                let units = 16.0 + 4.0 * (logits[i].abs() + total.ln());
+                check(
+                    &format!("gradient {i} of {name} at {}", logits[i]),
+                    *got,
+                    Double(sign * exact(i), 0.0),
+                    0,
+                    units,
+                )?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Cumulative products and their gradients where others are out of range; exact, since the elements are powers of two
+/// but for one, and one product alone has a gradient.
+fn products<T: Scalar>(powers: &[i32], odd: usize, at: usize) -> Result<(), TestCaseError> {
+    let (n, [low, high]) = (powers.len(), exponents::<T>());
+    let (odd, at) = (odd % n, at % n);
+    let significand = |i: usize| if i == odd { 1.5 } else { 1.0 };
+    let power = |i: usize| powers[i] % high;
+    let tape = Tape::<T>::new();
+    let x = tape.leaf(Tensor::from_fn(&[n], |i| T::from_f64(lifted(significand(i), power(i)))));
+    let y = x.cumprod(0);
+    let expect = |what: &str, got: T, significand: f64, power: i32| {
+        if power > low && power < high {
+            let expected = T::from_f64(lifted(significand, power));
+            prop_assert!(got == expected, "{what}: {got} for {expected}, of {powers:?}");
+        }
+        Ok(())
+    };
+    for i in 0..n {
+        let significand: f64 = (0..=i).map(significand).product();
+        expect("cumprod", y.value().as_slice()[i], significand, (0..=i).map(power).sum())?;
+    }
+    let picked = y.slice_axis(0, at..=at).sum();
+    for grad in [picked.grad(&[&x]).remove(0), picked.grad_graph(&[&x]).remove(0).into_value()] {
+        for i in 0..n {
+            let others = (0..=at).filter(|&j| j != i);
+            let significand: f64 = if i > at { 0.0 } else { others.clone().map(significand).product() };
+            expect("gradient of cumprod", grad.as_slice()[i], significand, others.map(power).sum())?;
+        }
+    }
+    Ok(())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 1000, ..ProptestConfig::default() })]
+
+    #[test]
+    fn reductions_of_every_binade_agree_with_an_exact_oracle(row in row(40), place in 0.0..1.0) {
+        reductions::<f32>(&row, place)?;
+        reductions::<f64>(&row, place)?;
+    }
+
+    #[test]
+    fn layer_norm_of_every_binade_agrees_with_an_exact_oracle(
+        row in row(40), place in 0.0..1.0, epsilon in prop::option::of(-40..40)
+    ) {
+        layer_norms::<f32>(&row, place, epsilon)?;
+        layer_norms::<f64>(&row, place, epsilon)?;
+    }
+
+    #[test]
+    fn scaling_by_a_power_of_two_is_exact(
+        row in prop::collection::vec((1.0..2.0, -5..5, any::<bool>()), 1..40), place in 0.0..1.0
+    ) {
+        let row: Vec<f64> =
+            row.into_iter().map(|(x, power, minus)| lifted(x, power) * if minus { -1.0 } else { 1.0 }).collect();
+        scaling::<f32>(&row, place)?;
+        scaling::<f64>(&row, place)?;
+    }
+
+    #[test]
+    fn sums_are_within_the_pairwise_bound(row in row(80), repeats in 1_usize..60, place in 0.0..1.0) {
+        sums::<f32>(&row, repeats, place)?;
+        sums::<f64>(&row, repeats, place)?;
+    }
+
+    #[test]
+    fn large_gradients_lift_probabilities_that_underflow(
+        row in prop::collection::vec(0.0..1.0, 1..40), lift in -1.0..1.0
+    ) {
+        lifted_probabilities::<f32>(&row, lift)?;
+        lifted_probabilities::<f64>(&row, lift)?;
+    }
+
+    #[test]
+    fn cumulative_products_come_back_into_range(
+        powers in prop::collection::vec(-1000..1000, 1..20), odd: usize, at: usize
+    ) {
+        products::<f32>(&powers, odd, at)?;
+        products::<f64>(&powers, odd, at)?;
+    }
+}
+
+#[test]
+fn deviation_of_numbers_whose_squares_overflow() {
+    let tape = Tape::<f32>::new();
+    let x = tape.leaf(Tensor::from([1e25_f32, 2e25, 3e25, 4e25]));
+    let y = x.std(0);
+    assert_eq!(y.item(), 1.118_034e25);
+    for grad in [y.grad(&[&x]).remove(0), y.grad_graph(&[&x]).remove(0).into_value()] {
+        for (got, expected) in grad.iter().zip([-0.335_410_2_f32, -0.111_803_4, 0.111_803_4, 0.335_410_2]) {
+            assert!((got / expected - 1.0).abs() < 2e-7, "{grad:?}");
+        }
+    }
+}
+
+/// As many windows on one pixel as a window has pixels, all with one gradient, whose plain sum in f32 is off by 4e-5.
+#[test]
+fn many_windows_on_one_pixel() {
+    let n = 4096;
+    let tape = Tape::<f32>::new();
+    let x = tape.leaf(Tensor::from_fn(&[1, 1, 1, 2 * n - 1], |i| if i == n - 1 { 1.0 } else { 0.0 }));
+    let config = Pool2dConfig { stride: [1, 1], ..Pool2dConfig::new([1, n]) };
+    let expected = f64::from(0.1_f32) * n as f64;
+    let at = |y: Var<'_, f32>| f64::from((y * 0.1).sum().grad(&[&x])[0].as_slice()[n - 1]);
+    let (max, average) = (at(x.max_pool2d(&config)), n as f64 * at(x.avg_pool2d(&config)));
+    let mean = f64::from(tape.constant(Tensor::full(&[1, 1, 1, n], 0.1)).avg_pool2d(&config).item()) * n as f64;
+    for sum in [max, average, mean] {
+        assert!((sum / expected - 1.0).abs() < 1e-6, "{sum} for {expected}");
+    }
+}
+
+/// A mean in range of numbers whose sum is not, and deviations from it that are not.
+#[test]
+fn means_at_the_end_of_the_range() {
+    fn check<T: Scalar>(most: T) {
+        let tape = Tape::<T>::new();
+        let x = tape.leaf(Tensor::from_fn(&[4], |i| if i == 0 { most } else { -most }));
+        let half = T::from_f64(0.5) * most;
+        assert_eq!((x.mean().item(), x.value().mean()), (-half, -half));
+        assert_eq!(x.mean().grad(&[&x])[0], Tensor::full(&[4], T::from_f64(0.25)));
+        for (x, axis) in [(x.reshape(&[4, 1]).broadcast_to(&[4, 2]), 0), (x.reshape(&[1, 4]), 1)] {
+            let y = x.std_over(axis, 0);
+            let expected = 0.75_f64.sqrt() * most.to_f64();
+            assert!(y.value().iter().all(|y| (y.to_f64() / expected - 1.0).abs() < 4.0 * T::EPSILON), "{y:?}");
+            let grad = y.sum().grad(&[&x]).remove(0);
+            let first = grad.as_slice()[0].to_f64();
+            assert!((first - 0.75_f64.sqrt() / 2.0).abs() < 4.0 * T::EPSILON, "{grad:?}");
+        }
+        // Equal numbers have no deviation, and no gradient.
+        let x = tape.leaf(Tensor::full(&[3], most));
+        let (y, z) = (x.std(0), x.var(0));
+        assert_eq!((y.item(), z.item(), x.norm_over(Axes::from(0)).item().is_finite()), (T::ZERO, T::ZERO, false));
+        for grad in [y.grad(&[&x]), z.grad(&[&x])] {
+            assert_eq!(grad[0], Tensor::zeros(&[3]));
+        }
+    }
+    check(f32::MAX);
+    check(f64::MAX);
+}
