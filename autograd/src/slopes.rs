@@ -1,7 +1,8 @@
 //! Derivatives of the elementary functions: each takes the slope `s` of the argument and returns that of the result.
 //!
 //! A slope is an incoming gradient times a derivative. It may be an ordinary number where the derivative alone, or a
-//! product on the way to it, is out of range: so such products are [`Wide`].
+//! product on the way to it, is out of range: so such products are [`Wide`]. Products and quotients have the same order as
+//! the quick ones, and so the same bits: a power of two as a factor of the operands is one of the result.
 
 use raygrad_tensor::{Real, Wide};
 use std::f64::consts::{LN_2, PI};
@@ -179,7 +180,7 @@ pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
     let (a, b) = (a / scale, b / scale);
     let square = a * a + b * b;
     let square = square.if_positive(square, one);
-    let exact = || (s.wide() * c.wide() / (scale.wide() * scale.wide() * square.wide())).narrow();
+    let exact = || (s.wide() / scale.wide() / square.wide() * (c.wide() / scale.wide())).narrow();
     E::checked(s / scale / square * (c / scale), [s, c, scale], [], exact)
 }
 
@@ -198,7 +199,7 @@ pub(crate) fn product_over<E: Real>(s: E, a: E, b: E) -> E {
 /// `s a / b^2`.
 #[inline(always)]
 pub(crate) fn over_square<E: Real>(s: E, a: E, b: E) -> E {
-    E::checked(s / b * (a / b), [s, a, b], [], || (s.wide() * a.wide() / (b.wide() * b.wide())).narrow())
+    E::checked(s / b * (a / b), [s, a, b], [], || (s.wide() / b.wide() * (a.wide() / b.wide())).narrow())
 }
 
 /// `s floor(a / b)`, from the remainder y.
@@ -229,12 +230,12 @@ pub(crate) fn powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
     match n {
         1 => s,
         2 => s * (x * factor),
-        3 => E::checked(s * x * x * factor, [s, x], [], || (s.wide() * factor.wide() * x.wide() * x.wide()).narrow()),
+        3 => E::checked(s * x * x * factor, [s, x], [], || (s.wide() * x.wide() * x.wide() * factor.wide()).narrow()),
         4 => {
-            let exact = || (s.wide() * factor.wide() * x.wide() * x.wide() * x.wide()).narrow();
+            let exact = || (s.wide() * x.wide() * x.wide() * x.wide() * factor.wide()).narrow();
             E::checked(s * x * x * x * factor, [s, x], [], exact)
         }
-        -1 => -E::checked(s / x / x, [s, x], [], || (s.wide() / (x.wide() * x.wide())).narrow()),
+        -1 => -E::checked(s / x / x, [s, x], [], || (s.wide() / x.wide() / x.wide()).narrow()),
         _ => any_powi_slope(s, x, n),
     }
 }

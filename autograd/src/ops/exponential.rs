@@ -133,7 +133,7 @@ impl Formula<1> for Rsqrt {
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
         let half = y.like(-0.5);
-        let exact = || (g.wide() * half.wide() * y.wide() * y.wide() * y.wide()).narrow();
+        let exact = || (g.wide() * y.wide() * y.wide() * (y.wide() * half.wide())).narrow();
         [E::checked(g * y * y * (y * half), [g], [], exact)]
     }
     fn cases(&self, c: &mut Cases) {
