@@ -191,7 +191,9 @@ def row(name, kind, path):
         if worst["raygrad"] > min(worst.values()) + 0.05:
             ordinary[0] = f"**{ordinary[0]}**"
         of = "value" if k == 0 else "gradient" if operands == 1 else f"gradient {k}"
-        lines.append(f"| `{re.sub("_(-?[0-9])", r", \1", name)}` {of} | {' | '.join(ordinary)} | {', '.join(r or '-' for r in rest)} |")
+        title = re.sub("_(-?[0-9])", r", \1", name)
+        counts = ", ".join(r or "-" for r in rest)
+        lines.append(f"| `{title}` {of} | {' | '.join(ordinary)} | {counts} |")
     return lines, len(cases)
 
 

@@ -383,7 +383,7 @@ fn lifted_probabilities<T: Scalar>(row: &[f64], lift: f64) -> Result<(), TestCas
     let g = T::from_f64(g).to_f64();
     let n = logits.len();
     let total = sum(logits.iter().map(|x| x.exp())).0;
-    // In two factors, of which none underflows in f64.
+    // In two factors: neither underflows in f64.
     let exact = |i: usize| (0.5 * logits[i]).exp() * g * (0.5 * logits[i]).exp() / total;
     let tape = Tape::<T>::new();
     let x = tape.leaf(Tensor::from_fn(&[1, n], |i| T::from_f64(logits[i])));

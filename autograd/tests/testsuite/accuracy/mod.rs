@@ -257,7 +257,7 @@ fn examine<T: Scalar>(operation: &Operation<T>, draws: usize) -> Vec<Column> {
             for (k, (exact, got)) in
                 [reference.value].into_iter().chain(slopes).zip([value].into_iter().chain(got)).enumerate()
             {
-                // Conventions decide at a few points, and derivatives of what is not finite are not compared.
+                // Conventions decide at a few points, and a derivative is compared where the value is finite.
                 let exact = exact.filter(|(exact, _)| k == 0 || exact.is_finite() && value.is_finite());
                 let is_compared = exact.is_some();
                 let gate = if k == 0 && FUNCTIONS.contains(&operation.name) { 2.0 } else { GATE };
