@@ -84,10 +84,11 @@ pub(crate) fn near_sigmoid<E: Real>(x: E, low: E) -> E {
     share.mul_add((share.like(1.0) - share) * low, share)
 }
 
-/// The derivative of the sigmoid by one exponential and one division. It has no derivative of its own at 0.
+/// The derivative of the sigmoid, an even function, by one exponential and one division.
 #[inline(always)]
 fn logistic_density<E: Real>(x: E) -> E {
-    let (one, e) = (x.like(1.0), (-x.abs()).exp());
+    // A choice and no absolute value, which has no derivative at 0.
+    let (one, e) = (x.like(1.0), x.if_positive(-x, x).exp());
     let share = one / (one + e);
     e * (share * share)
 }
@@ -174,12 +175,10 @@ pub(crate) fn atan_slope<E: Real>(s: E, x: E) -> E {
 /// `s c / (a^2 + b^2)` for c = a or b; 0 at the origin.
 #[inline(always)]
 pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
-    let (one, scale) = (a.like(1.0), a.abs().maximum(b.abs()));
-    // At the origin c is 0, and so is the result.
-    let scale = scale.if_positive(scale, one);
+    let (one, scale) = (a.like(1.0), unless_zero(a.abs().maximum(b.abs())));
     let (a, b) = (a / scale, b / scale);
     let square = a * a + b * b;
-    let square = square.if_positive(square, one);
+    let square = square.if_positive(square, square + one);
     let exact = || (s.wide() / scale.wide() / square.wide() * (c.wide() / scale.wide())).narrow();
     E::checked(s / scale / square * (c / scale), [s, c, scale], [], exact)
 }
@@ -187,7 +186,13 @@ pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
 /// The derivative `a / y` of the length y of a vector by its component a; 0 at the origin.
 #[inline(always)]
 pub(crate) fn length_slope<E: Real>(s: E, a: E, y: E) -> E {
-    product_over(s, a, y.if_positive(y, y.like(1.0)))
+    product_over(s, a, unless_zero(y))
+}
+
+/// `x`, which is not negative, and infinity for 0: a quotient by it is 0, and so are its derivatives.
+#[inline(always)]
+fn unless_zero<E: Real>(x: E) -> E {
+    x.if_positive(x, x + x.like(f64::INFINITY))
 }
 
 /// `s a / b`.
@@ -245,7 +250,8 @@ pub(crate) fn powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
 pub(crate) fn any_powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
     let (factor, power) = (x.like(f64::from(n)), x.powi(n.saturating_sub(1)));
     let exact = || (s.wide() * factor.wide() * E::Wide::powi(x, n.saturating_sub(1))).narrow();
-    E::checked(s * (factor * power), [], [power], exact)
+    // At 0 the quick product is right.
+    E::checked(s * (factor * power), [], [x.abs().if_positive(power, x.like(1.0))], exact)
 }
 
 /// The derivative of y = a^b by a.
@@ -263,7 +269,9 @@ pub(crate) fn base_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
         let y = is_ordinary.if_positive(y, one);
         (s.wide() * b.wide() * E::Wide::pow(base, b, y) / base.wide()).narrow()
     };
-    let full = E::checked(s * (b * power), [b], [power], exact);
+    // A zero base has its limit, and a subnormal y has lost digits.
+    let factors = [is_ordinary.if_positive(power, one), is_exact.if_positive(one, is_ordinary.if_positive(y, one))];
+    let full = E::checked(s * (b * power), [b], factors, exact);
     // At an infinite or a zero base; 0 where both are 0, and NaN where one is.
     let limit = (a.abs() + b.abs()).if_positive(s * (b * less), (a + b) * zero);
     is_ordinary.if_positive(full, limit)
@@ -275,7 +283,9 @@ pub(crate) fn exponent_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let (zero, one, size) = (a.like(0.0), a.like(1.0), a.abs());
     // A logarithm that is finite where it is not chosen, or the next derivative would be NaN.
     let ln = size.if_positive(a, one).ln();
-    let full = E::checked(s * (y * ln), [], [y], || (s.wide() * E::Wide::pow(a, b, y) * ln.wide()).narrow());
+    let full = E::checked(s * (y * ln), [], [size.if_positive(y, one)], || {
+        (s.wide() * E::Wide::pow(a, b, y) * ln.wide()).narrow()
+    });
     let at_zero = s * (-b).if_positive(y * size.ln(), y * zero + a * zero);
     size.if_positive(full, at_zero)
 }

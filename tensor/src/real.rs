@@ -84,7 +84,8 @@ pub trait Real:
     fn mul_add(self, factor: Self, summand: Self) -> Self;
 
     /// `quick`, or `exact` where `quick` may have left the range of the type on the way: where one of the `inputs` is
-    /// neither 0 nor within 2^-63 and 2^63 (2^-511 and 2^511 for f64), or one of the `factors` is not.
+    /// neither 0 nor within 2^-63 and 2^63 (2^-511 and 2^511 for f64), or one of the `factors` is not within. Dual
+    /// numbers and those that stand for variables take `quick`.
     fn checked<const K: usize, const M: usize>(
         quick: Self,
         inputs: [Self; K],

@@ -59,6 +59,7 @@ pub fn variance_to<T: Scalar>(x: &Tensor<T>, kept: &[usize], correction: f64, ro
 /// If `kept` does not broadcast to the shape of `x`.
 #[track_caller]
 pub fn norm_to<T: Scalar>(x: &Tensor<T>, kept: &[usize], pool: &Pool<T>) -> Tensor<T> {
+    assert_eq!(kept.len(), x.ndim(), "as many axes as the tensor has");
     let sums = sum_to(&squares(x, pool), kept, pool);
     if sums.iter().all(is_safe) {
         return sums.sqrt();

@@ -159,11 +159,7 @@ fn choices() -> Vec<Entry> {
         choice(&[3]).sample(&[&[2, 1], &[]]).sample(&[&[0, 3], &[1]]),
         choice(&[2, 1]).sample(&[&[1, 3], &[]]),
         choice(&[]).sample(&[&[], &[]]),
-        Entry::new(select::Lerp).sample(&[&[2, 3], &[2, 3], &[2, 3]]).sample(&[&[3], &[2, 1], &[]]).sample(&[
-            &[0, 3],
-            &[3],
-            &[1],
-        ]),
+        Entry::examined(select::Lerp),
     ]
 }
 

@@ -1,8 +1,8 @@
 //! Comparisons, selection by a mask, and interpolation.
 
 use crate::error::ensure;
-use crate::{Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Mask, Pool, Scalar, Shape, Tensor, broadcast_shape, choose, map};
+use crate::{Cases, Formula, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Mask, Pool, Real, Scalar, Shape, Tensor, broadcast_shape, choose};
 
 /// y = yes where the mask is true, else no.
 #[derive(Clone)]
@@ -36,35 +36,38 @@ impl<T: Scalar> Op<T> for Where {
     }
 }
 
-/// y = a + w (b - a), and exactly b for w = 1.
+/// y = a + w (b - a), and exactly b for w = 1; da = g (1 - w), db = g w, dw = g (b - a).
 #[derive(Clone, Copy)]
 pub struct Lerp;
 
-impl<T: Scalar> Op<T> for Lerp {
-    fn name(&self) -> &'static str {
-        "lerp"
+impl Lerp {
+    /// `(b - a) c` and c, which is 1, or 1/2 where the difference overflows.
+    #[inline(always)]
+    fn difference<E: Real>(a: E, b: E) -> [E; 2] {
+        let (zero, half, one) = (a.like(0.0), a.like(0.5), a.like(1.0));
+        let scale = (one + (b - a) * zero).if_positive(one, half);
+        [b * scale - a * scale, scale]
     }
+}
 
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        broadcast_shape(x).ok_or_else(|| "the shapes do not broadcast".into())
+impl Formula<3> for Lerp {
+    const NAME: &'static str = "lerp";
+    #[inline(always)]
+    fn f<E: Real>(&self, [a, b, w]: [E; 3]) -> E {
+        let [difference, scale] = Lerp::difference(a, b);
+        // From the nearer end.
+        let is_far = w - w.like(0.5);
+        let (from, share) = (is_far.if_positive(b, a), is_far.if_positive(w - w.like(1.0), w));
+        share.mul_add(difference, from * scale) / scale
     }
-
-    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let half = T::from_f64(0.5);
-        map(
-            [x[0], x[1], x[2]],
-            pool,
-            #[inline(always)]
-            |[a, b, w]| if w < half { a + w * (b - a) } else { b - (T::ONE - w) * (b - a) },
-        )
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [a, b, w]: [E; 3], _y: E) -> [E; 3] {
+        let [difference, scale] = Lerp::difference(a, b);
+        [g * (w.like(1.0) - w), g * w, g * difference / scale]
     }
-
-    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (a, b, w, g) = (cx.x(0), cx.x(1), cx.x(2), cx.g());
-        let da = cx.needs(0).then(|| (g * (1.0 - &w)).sum_to(cx.shape(0)));
-        let db = cx.needs(1).then(|| (g * &w).sum_to(cx.shape(1)));
-        let dw = cx.needs(2).then(|| (g * (&b - &a)).sum_to(cx.shape(2)));
-        Grads::new([da, db, dw])
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).domain(-3.0..3.0).domain(-1.0..2.0);
+        c.at([0.1, 0.7, 0.0], 0.1, [1.0, 0.0, 0.6]).at([0.1, 0.7, 1.0], 0.7, [0.0, 1.0, 0.6]);
     }
 }
 
@@ -170,7 +173,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes do not broadcast.
     #[track_caller]
     pub fn lerp(&self, end: impl Operand<'t, T>, weight: impl Operand<'t, T>) -> Self {
-        self.tape().apply(Lerp, &[self, &end.on(self.tape()), &weight.on(self.tape())])
+        Lerp.on([self, &end.on(self.tape()), &weight.on(self.tape())])
     }
 }
 

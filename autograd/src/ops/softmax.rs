@@ -17,11 +17,9 @@ fn kept_last() -> Axes {
     Axes::from(-1).keepdims()
 }
 
-/// `e^x g`, where the power may underflow if `g` brings it back into range.
+/// `e^x g`, where the power may underflow if `g` brings it back into range: from the root of the power, for all elements
+/// alike.
 fn power_times<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
-    if g.value().iter().all(|g| g.abs() <= T::ONE) {
-        return x.exp() * g;
-    }
     let root = (x * 0.5).exp();
     &root * g * &root
 }

@@ -112,8 +112,7 @@ fn standard<'a, T: Scalar>(x: &'a [T], eps: f64, space: &'a mut Vec<T>) -> (&'a 
 }
 
 /// Layer normalisation of each row: `(x - mean) / sqrt(variance + eps) * gain + bias`, with the variance divided by
-/// `n`.
-/// It is right wherever the result is in range, whatever the squares.
+/// `n`. It is right wherever the result is in range, whatever the squares.
 ///
 /// # Panics
 /// If `gain` and `bias` have different lengths, `x` is not whole rows of that length, or `out` is shorter than `x`.

@@ -67,7 +67,7 @@ macro_rules! functions_of {
                 ((e * Wide::new(0.5)).narrow(), 0.5 / e.narrow())
             }
 
-            /// The distribution function of the standard normal distribution, within 4 ULP.
+            /// The distribution function of the standard normal distribution, within 5 ULP.
             #[inline(always)]
             pub fn normal_cdf(x: $t) -> $t {
                 Wide::normal_cdf(x).narrow()

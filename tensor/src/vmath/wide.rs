@@ -87,7 +87,8 @@ macro_rules! wide {
 
                 #[inline(always)]
                 fn normal_cdf(x: $t) -> Self {
-                    // Close to 0, (1 + erf(x / sqrt 2)) / 2. Beyond, the tail is P(-t) = e^(-t^2/2) p(u) / (t + 5), with u = (t - 5) / (t + 5).
+                    // Close to 0, (1 + erf(x / sqrt 2)) / 2. Beyond, the tail is P(-t) = e^(-t^2/2) p(u) / (t + 5), with
+                    // u = (t - 5) / (t + 5).
                     let t = clamp(x.abs(), 0.0, 70.0);
                     let inverse = 1.0 / (t + 5.0);
                     let ratio = polynomial((t - 5.0) * inverse, $tail) * inverse;

@@ -35,8 +35,8 @@ pub struct Adam<T: Scalar> {
 }
 
 /// Makes an [`Adam`] with decoupled weight decay (Loshchilov and Hutter 2019, algorithm 2). Before each step a
-/// parameter is multiplied by `1 - rate decay`, even where that rounds to 1 in the parameter's type. There is no decay of an element whose gradient is infinite or NaN, or
-/// of a row without gradient of a lazy parameter.
+/// parameter is multiplied by `1 - rate decay`, even where that rounds to 1 in the parameter's type. There is no decay
+/// of an element whose gradient is infinite or NaN, or of a row without gradient of a lazy parameter.
 #[derive(Debug, Clone, Copy)]
 pub struct AdamW;
 

@@ -64,7 +64,9 @@ impl Format {
 
     /// The exponent of a unit in the last place of the exact result or of its largest term.
     fn unit(&self, exact: Exact, term: Exact) -> i64 {
-        exact.exponent().max(term.exponent()).max(self.least) - self.digits
+        // A zero has no exponent.
+        let exponent = |x: Exact| if x.is_zero() { self.least } else { x.exponent() };
+        exponent(exact).max(exponent(term)).max(self.least) - self.digits
     }
 
     /// The error of `got`, in units in the last place of the exact result or of its largest term. Infinite where the
@@ -160,9 +162,22 @@ impl Random {
         }
     }
 
+    /// The same operands; one time in four the second is equal or close to the first.
+    fn related<T: Scalar>(&mut self, mut x: Vec<f64>) -> Vec<f64> {
+        if x.len() > 1 && self.below(4) == 0 {
+            let step = 2.0_f64.powi(-(self.below(Format::of::<T>().digits + 2)) as i32);
+            let near = T::from_f64(x[0] * (1.0 + step * (self.below(3) - 1) as f64)).to_f64();
+            x[1] = if near.is_finite() { near } else { x[0] };
+        }
+        x
+    }
+
     /// An incoming gradient: of any bits, or so that a gradient is a normal number.
     fn gradient<T: Scalar>(&mut self, reference: &Reference) -> f64 {
         let slope = reference.slopes[self.below(reference.slopes.len() as i64) as usize].0;
+        if self.below(32) == 0 {
+            return 0.0;
+        }
         if self.below(2) == 0 || slope.is_zero() || !slope.is_finite() {
             return self.pattern::<T>();
         }
@@ -194,9 +209,8 @@ impl Column {
     }
 }
 
-/// A file of arguments, gradients and exact results for `benches/peers/accuracy.py`: the number of operands, and for each
-/// case the arguments, the
-/// incoming gradient, and for the value and each gradient what [`Dump::result`] writes.
+/// A file of arguments, gradients and exact results for `benches/peers/accuracy.py`: the number of operands, and for
+/// each case the arguments, the incoming gradient, and what [`Dump::result`] writes of the value and of each gradient.
 struct Dump(Option<std::io::BufWriter<std::fs::File>>);
 
 impl Dump {
@@ -236,7 +250,7 @@ fn examine<T: Scalar>(operation: &Operation<T>, draws: usize) -> Vec<Column> {
                 let mut random = Random((batch as u64) << 32 | i as u64);
                 random.bits();
                 let x: Vec<f64> = (0..operation.operands).map(|_| random.argument::<T>()).collect();
-                let x = (operation.domain)(x);
+                let x = (operation.domain)(random.related::<T>(x));
                 let reference = (operation.reference)(&x);
                 let g = random.gradient::<T>(&reference);
                 (x, reference, g)

@@ -123,7 +123,7 @@ macro_rules! pairs {
 
 /// Every elementwise operation.
 pub fn operations<T: Scalar>() -> Vec<Operation<T>> {
-    [functions(), activations(), powers(), binary(), losses()].into_iter().flatten().collect()
+    [functions(), activations(), powers(), binary(), vec![lerp()], losses()].into_iter().flatten().collect()
 }
 
 fn functions<T: Scalar>() -> Vec<Operation<T>> {
@@ -268,6 +268,10 @@ fn binary<T: Scalar>() -> Vec<Operation<T>> {
             let share = |lead: f64| Exact::new(if lead > 0.0 { 1.0 } else if lead < 0.0 { 0.0 } else { 0.5 });
             of(Exact::new(a.max(b)), [share(a - b), share(b - a)])
         };
+        "minimum": |v| v[0].minimum(&v[1]), |a, b| {
+            let share = |lead: f64| Exact::new(if lead > 0.0 { 1.0 } else if lead < 0.0 { 0.0 } else { 0.5 });
+            of(Exact::new(a.min(b)), [share(b - a), share(a - b)])
+        };
         "atan2": |v| v[0].atan2(&v[1]), |a, b| {
             if a == 0.0 {
                 // The sign of a zero decides, which this arithmetic does not have.
@@ -310,6 +314,16 @@ fn binary<T: Scalar>() -> Vec<Operation<T>> {
             of(y, [one(), -((Exact::new(a) - y) / Exact::new(b))])
         };
     }
+}
+
+fn lerp<T: Scalar>() -> Operation<T> {
+    let reference = |x: &[f64]| {
+        let [a, b, w] = [x[0], x[1], x[2]].map(Exact::new);
+        // From the nearer end, as documented: these are the terms that may cancel.
+        let (from, share) = if w > Exact::new(0.5) { (b, w - one()) } else { (a, w) };
+        with_terms(sum(from, share * (b - a)), [one() - w, w, b - a].map(|slope| (slope, slope)))
+    };
+    Operation { name: "lerp", operands: 3, function: |v| v[0].lerp(&v[1], &v[2]), domain: |x| x, reference }
 }
 
 fn losses<T: Scalar>() -> Vec<Operation<T>> {
