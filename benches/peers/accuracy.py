@@ -125,8 +125,8 @@ The versions are {versions}.
   8 ULP of the three libraries in this order. XLA takes subnormal numbers for 0.
 - At kinks and ties the libraries have other conventions, which count as errors here.
 - JAX has no binary cross-entropy, Huber and smooth L1 loss: those are written with `jnp.where`.
-- **Bold**: raygrad's worst error is not the smallest. Most of its functions are straight-line code with the same bits on
-  every instruction set ([vector math](vector-math.md)). That costs some tenths of a unit.
+- **Bold**: raygrad's worst error is not the smallest. Most of its functions are straight-line code with the same bits
+  on every instruction set ([vector math](vector-math.md)). That costs some tenths of a unit.
 
 """
 

@@ -10,7 +10,7 @@ mod operations;
 
 use exact::Exact;
 use operations::{Operation, Reference, operations};
-use raygrad_autograd::{Scalar, Tape, Tensor};
+use raygrad_autograd::{Scalar, Tape, Tensor, Var};
 use rayon::prelude::*;
 
 /// Errors above this many units in the last place are breaches.
@@ -330,6 +330,80 @@ fn every_operation_is_within_8_units_in_the_last_place() {
     let draws = std::env::var("ACCURACY_DRAWS").map_or(2000, |draws| draws.parse().unwrap());
     let failed: Vec<_> = check::<f32>(draws).into_iter().chain(check::<f64>(draws)).collect();
     assert!(failed.is_empty(), "beyond {GATE} units in the last place:\n{}", failed.join("\n"));
+}
+
+/// The gradient of one function at many arguments, for one incoming gradient.
+fn gradient(f: for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>, x: &[f32], g: f32) -> Vec<f32> {
+    let tape = Tape::new();
+    let x = tape.leaf(Tensor::from_vec(&[x.len()], x.to_vec()));
+    let y = f(&x);
+    let g = tape.constant(Tensor::full(y.shape(), g));
+    tape.no_grad(|| y.vjp(&g, &[&x])).remove(0).value().as_slice().to_vec()
+}
+
+/// Blocks with an extreme element run again: that changes no other element.
+#[test]
+fn no_element_depends_on_its_neighbours() {
+    let functions: [for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>; 11] = [
+        |x| x.exp(),
+        |x| x.tanh(),
+        |x| x.sigmoid(),
+        |x| x.softplus(),
+        |x| x.gelu(),
+        |x| x.gelu_tanh(),
+        |x| x.silu(),
+        |x| x.reciprocal(),
+        |x| x.powi(3),
+        |x| x.powf(1.75),
+        |x| x.rsqrt(),
+    ];
+    let x: Vec<f32> = (0..1000).map(|i| 0.01 + i as f32 * 0.003).collect();
+    for (k, f) in functions.into_iter().enumerate() {
+        let alone = gradient(f, &x, 0.7);
+        for extreme in [1e-30, 1e30, -100.0, f32::NAN] {
+            let with: Vec<f32> = x.iter().copied().chain([extreme]).collect();
+            assert_eq!(gradient(f, &with, 0.7)[..1000], alone, "function {k} beside {extreme}");
+        }
+    }
+}
+
+/// Gradients that are recorded for higher orders are ordinary products, but no worse than that.
+#[test]
+fn recorded_slopes_are_in_range_where_their_factors_are() {
+    let tape = Tape::<f32>::new();
+    let recorded = |f: for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>, x: f32| {
+        let x = tape.leaf(Tensor::scalar(x));
+        let first = f(&x).grad_graph(&[&x]).remove(0);
+        [first.item(), first.grad(&[&x])[0].item()]
+    };
+    assert_eq!(recorded(|x| x.powf(2.0), 1e-23), [2e-23, 2.0]);
+    assert!((recorded(|x| x.sinh(), 89.0)[0] / 2.244_806_2e38 - 1.0).abs() < 1e-6);
+    assert_eq!(recorded(|x| x.tanh(), 0.0), [1.0, 0.0]);
+    assert_eq!(recorded(|x| x.sigmoid(), 0.0), [0.25, 0.0]);
+    let third = |f: for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>| {
+        let x = tape.leaf(Tensor::scalar(0.0));
+        let second = f(&x).grad_graph(&[&x]).remove(0).grad_graph(&[&x]).remove(0);
+        second.grad(&[&x])[0].item()
+    };
+    assert_eq!((third(|x| x.tanh()), third(|x| x.sigmoid())), (-2.0, -0.125));
+}
+
+/// A vector without direction has no derivative of any order, and one that is NaN has no gradient but NaN.
+#[test]
+fn directions_and_lengths_at_the_origin_and_of_nan() {
+    let functions: [for<'t> fn(&Var<'t, f64>, &Var<'t, f64>) -> Var<'t, f64>; 2] =
+        [|a, b| a.hypot(b), |a, b| a.atan2(b)];
+    for f in functions {
+        let tape = Tape::new();
+        let [a, b] = [0.0, 0.0].map(|x| tape.leaf(Tensor::scalar(x)));
+        let grads = f(&a, &b).grad_graph(&[&a, &b]);
+        for grad in grads {
+            let second: Vec<f64> = grad.grad(&[&a, &b]).iter().map(Tensor::item).collect();
+            assert_eq!((grad.item(), &second[..]), (0.0, &[0.0; 2][..]));
+        }
+        let [a, b] = [f64::NAN, 2.0].map(|x| tape.leaf(Tensor::scalar(x)));
+        assert!(f(&a, &b).grad(&[&a, &b]).iter().all(|grad| grad.item().is_nan()));
+    }
 }
 
 /// Values of mpmath, written by `reference/exact.py`.
