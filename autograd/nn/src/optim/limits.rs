@@ -37,13 +37,10 @@ pub(crate) fn smallest_eps<T: Scalar>(beta2: f64) -> f64 {
 /// A scaled second moment as in a saved state: without its factor, so that all versions read the same number. One that
 /// would be denormal stays scaled and gets a minus sign, so that it keeps its digits.
 pub(crate) fn saved_moment<T: Scalar>(scaled: T) -> T {
-    let factor = moment_root::<T>().powi(2);
-    let moment = scaled.to_f64() / factor;
-    T::from_f64(if moment < by_type::<T>(f32::MIN_POSITIVE.into(), f64::MIN_POSITIVE) {
-        -scaled.to_f64()
-    } else {
-        moment
-    })
+    let (least, scaled) = (by_type::<T>(f32::MIN_POSITIVE.into(), f64::MIN_POSITIVE), scaled.to_f64());
+    let moment = scaled / moment_root::<T>().powi(2);
+    let is_denormal = moment < least && scaled > 0.0;
+    T::from_f64(if is_denormal { -scaled } else { moment })
 }
 
 /// The inverse of [`saved_moment`]. Earlier versions had larger moments: they become the largest.
