@@ -332,8 +332,14 @@ fn every_operation_is_within_8_units_in_the_last_place() {
     assert!(failed.is_empty(), "beyond {GATE} units in the last place:\n{}", failed.join("\n"));
 }
 
+/// A function of one operand in single precision.
+type Single = for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>;
+
+/// A function of two operands in double precision.
+type Double = for<'t> fn(&Var<'t, f64>, &Var<'t, f64>) -> Var<'t, f64>;
+
 /// The gradient of one function at many arguments, for one incoming gradient.
-fn gradient(f: for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>, x: &[f32], g: f32) -> Vec<f32> {
+fn gradient(f: Single, x: &[f32], g: f32) -> Vec<f32> {
     let tape = Tape::new();
     let x = tape.leaf(Tensor::from_vec(&[x.len()], x.to_vec()));
     let y = f(&x);
@@ -344,7 +350,7 @@ fn gradient(f: for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>, x: &[f32], g: f32) -> 
 /// Blocks with an extreme element run again: that changes no other element.
 #[test]
 fn no_element_depends_on_its_neighbours() {
-    let functions: [for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>; 11] = [
+    let functions: [Single; 11] = [
         |x| x.exp(),
         |x| x.tanh(),
         |x| x.sigmoid(),
@@ -371,7 +377,7 @@ fn no_element_depends_on_its_neighbours() {
 #[test]
 fn recorded_slopes_are_in_range_where_their_factors_are() {
     let tape = Tape::<f32>::new();
-    let recorded = |f: for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>, x: f32| {
+    let recorded = |f: Single, x: f32| {
         let x = tape.leaf(Tensor::scalar(x));
         let first = f(&x).grad_graph(&[&x]).remove(0);
         [first.item(), first.grad(&[&x])[0].item()]
@@ -380,7 +386,7 @@ fn recorded_slopes_are_in_range_where_their_factors_are() {
     assert!((recorded(|x| x.sinh(), 89.0)[0] / 2.244_806_2e38 - 1.0).abs() < 1e-6);
     assert_eq!(recorded(|x| x.tanh(), 0.0), [1.0, 0.0]);
     assert_eq!(recorded(|x| x.sigmoid(), 0.0), [0.25, 0.0]);
-    let third = |f: for<'t> fn(&Var<'t, f32>) -> Var<'t, f32>| {
+    let third = |f: Single| {
         let x = tape.leaf(Tensor::scalar(0.0));
         let second = f(&x).grad_graph(&[&x]).remove(0).grad_graph(&[&x]).remove(0);
         second.grad(&[&x])[0].item()
@@ -391,8 +397,7 @@ fn recorded_slopes_are_in_range_where_their_factors_are() {
 /// A vector without direction has no derivative of any order, and one that is NaN has no gradient but NaN.
 #[test]
 fn directions_and_lengths_at_the_origin_and_of_nan() {
-    let functions: [for<'t> fn(&Var<'t, f64>, &Var<'t, f64>) -> Var<'t, f64>; 2] =
-        [|a, b| a.hypot(b), |a, b| a.atan2(b)];
+    let functions: [Double; 2] = [|a, b| a.hypot(b), |a, b| a.atan2(b)];
     for f in functions {
         let tape = Tape::new();
         let [a, b] = [0.0, 0.0].map(|x| tape.leaf(Tensor::scalar(x)));
