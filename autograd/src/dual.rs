@@ -279,15 +279,6 @@ impl<E: Real, const N: usize> Real for Dual<E, N> {
         let (a, b) = (self.value, factor.value);
         Dual { value: a.mul_add(b, summand.value), ..self * factor + summand }
     }
-    #[inline(always)]
-    fn checked<const K: usize, const M: usize>(
-        quick: Self,
-        _inputs: [Self; K],
-        _factors: [Self; M],
-        _exact: impl FnOnce() -> Self,
-    ) -> Self {
-        quick
-    }
     type Wide = Plain<Self>;
     #[inline(always)]
     fn powi(self, exponent: i32) -> Self {

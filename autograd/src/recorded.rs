@@ -175,15 +175,6 @@ impl<T: Scalar> Real for Recorded<'_, '_, T> {
     fn mul_add(self, factor: Self, summand: Self) -> Self {
         self * factor + summand
     }
-    #[inline(always)]
-    fn checked<const K: usize, const M: usize>(
-        quick: Self,
-        _inputs: [Self; K],
-        _factors: [Self; M],
-        _exact: impl FnOnce() -> Self,
-    ) -> Self {
-        quick
-    }
     type Wide = Plain<Self>;
     raygrad_tensor::functions!(recorded());
 }
