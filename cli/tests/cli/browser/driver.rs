@@ -258,6 +258,7 @@ impl Browser {
         }
     }
 
+    /// Opens a page and waits until its scripts have run.
     pub fn go(&mut self, url: &str) {
         match self.kind {
             Kind::Chromium => self.call("Page.navigate", json!({ "url": url })),
@@ -265,6 +266,7 @@ impl Browser {
                 self.call("browsingContext.navigate", json!({ "context": self.page, "url": url, "wait": "complete" }))
             }
         };
+        self.until("document.readyState === 'complete'");
     }
 
     /// Opens a program's page and waits for the scene.
