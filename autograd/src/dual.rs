@@ -256,9 +256,9 @@ impl<E: Real, const N: usize> Real for Dual<E, N> {
             other,
             y,
             #[inline(always)]
-            |s| length_slope(s, a, y),
+            |s| length_slope(s, a, b, y),
             #[inline(always)]
-            |t| length_slope(t, b, y),
+            |t| length_slope(t, b, a, y),
         )
     }
     #[inline(always)]

@@ -7,6 +7,20 @@
 use raygrad_tensor::{Real, Wide};
 use std::f64::consts::{LN_2, PI};
 
+/// [`Real::checked`] with an expression in place of the closure. Only inlined closures are vectorised.
+macro_rules! checked {
+    ($quick:expr, $inputs:expr, $factors:expr, $exact:expr) => {
+        raygrad_tensor::Real::checked(
+            $quick,
+            $inputs,
+            $factors,
+            #[inline(always)]
+            || $exact,
+        )
+    };
+}
+pub(crate) use checked;
+
 /// `x`, but at least `low`; NaN stays NaN.
 #[inline(always)]
 pub(crate) fn at_least<E: Real>(x: E, low: f64) -> E {
@@ -24,7 +38,7 @@ pub(crate) fn at_most<E: Real>(x: E, high: f64) -> E {
 /// `s e^x`, for y = e^x.
 #[inline(always)]
 pub(crate) fn exp_slope<E: Real>(s: E, x: E, y: E) -> E {
-    E::checked(s * y, [], [y], || (s.wide() * E::Wide::exp(x, x.like(0.0))).narrow())
+    checked!(s * y, [], [y], (s.wide() * E::Wide::exp(x, x.like(0.0))).narrow())
 }
 
 /// `s e^(c x^2)`, for a power of two `c`. The rounding error of the square counts as many times as the square is large.
@@ -32,7 +46,7 @@ pub(crate) fn exp_slope<E: Real>(s: E, x: E, y: E) -> E {
 pub(crate) fn bell<E: Real>(s: E, x: E, c: f64) -> E {
     let [square, low] = scaled_square(x, c);
     let y = square.exp();
-    E::checked(s * y.mul_add(low, y), [], [y], || (s.wide() * wide_bell(x, c)).narrow())
+    checked!(s * y.mul_add(low, y), [], [y], (s.wide() * wide_bell(x, c)).narrow())
 }
 
 /// `e^(c x^2)`, for a power of two `c`.
@@ -56,7 +70,7 @@ fn scaled_square<E: Real>(x: E, c: f64) -> [E; 2] {
 #[inline(always)]
 pub(crate) fn exp2_slope<E: Real>(s: E, x: E, y: E) -> E {
     let ln_2 = x.like(LN_2);
-    E::checked(s * (y * ln_2), [], [y], || {
+    checked!(s * (y * ln_2), [], [y], {
         let x = at_most(at_least(x, -4e3), 4e3);
         let half = (x.like(0.5) * x).round();
         let (root, rest) = (half.exp2().wide(), (x - half - half).exp2().wide());
@@ -74,7 +88,7 @@ pub(crate) fn wide_sigmoid<E: Real>(x: E) -> E::Wide {
 #[inline(always)]
 pub(crate) fn corrected_sigmoid<E: Real>(s: E, x: E, low: E) -> E {
     let share = near_sigmoid(x, low);
-    E::checked(s * share, [], [share], || (s.wide() * E::Wide::sigmoid(x, low)).narrow())
+    checked!(s * share, [], [share], (s.wide() * E::Wide::sigmoid(x, low)).narrow())
 }
 
 /// `1 / (1 + e^-(x + low))` for a rounding error `low` of x.
@@ -97,14 +111,14 @@ fn logistic_density<E: Real>(x: E) -> E {
 #[inline(always)]
 pub(crate) fn sigmoid_slope<E: Real>(s: E, x: E) -> E {
     let slope = logistic_density(x);
-    E::checked(s * slope, [], [slope], || (s.wide() * wide_sigmoid(x) * wide_sigmoid(-x)).narrow())
+    checked!(s * slope, [], [slope], (s.wide() * wide_sigmoid(x) * wide_sigmoid(-x)).narrow())
 }
 
 /// The derivative of softplus is the sigmoid.
 #[inline(always)]
 pub(crate) fn softplus_slope<E: Real>(s: E, x: E) -> E {
     let slope = x.sigmoid();
-    E::checked(s * slope, [], [slope], || (s.wide() * wide_sigmoid(x)).narrow())
+    checked!(s * slope, [], [slope], (s.wide() * wide_sigmoid(x)).narrow())
 }
 
 /// `1 - tanh^2 x` is four times the derivative of the sigmoid at 2x.
@@ -112,22 +126,21 @@ pub(crate) fn softplus_slope<E: Real>(s: E, x: E) -> E {
 pub(crate) fn tanh_slope<E: Real>(s: E, x: E) -> E {
     let (twice, four) = (x + x, x.like(4.0));
     let slope = four * logistic_density(twice);
-    let exact = || (s.wide() * four.wide() * wide_sigmoid(twice) * wide_sigmoid(-twice)).narrow();
-    E::checked(s * slope, [], [slope], exact)
+    checked!(s * slope, [], [slope], (s.wide() * four.wide() * wide_sigmoid(twice) * wide_sigmoid(-twice)).narrow())
 }
 
 /// `s cosh x`, as `s e^x / 2 + s e^-x / 2`.
 #[inline(always)]
 pub(crate) fn sinh_slope<E: Real>(s: E, x: E) -> E {
     let slope = x.cosh();
-    E::checked(s * slope, [], [slope], || half_exp(s, x) + half_exp(s, -x))
+    checked!(s * slope, [], [slope], half_exp(s, x) + half_exp(s, -x))
 }
 
 /// `s sinh x`, as a difference where it does not cancel.
 #[inline(always)]
 pub(crate) fn cosh_slope<E: Real>(s: E, x: E) -> E {
     let slope = x.sinh();
-    E::checked(s * slope, [slope], [], || {
+    checked!(s * slope, [slope], [], {
         let is_near = x.like(1.0) - x.abs();
         is_near.if_positive(s * slope, half_exp(s, x) - half_exp(s, -x))
     })
@@ -142,12 +155,11 @@ fn half_exp<E: Real>(s: E, x: E) -> E {
 #[inline(always)]
 pub(crate) fn cos_pi_slope<E: Real>(s: E, x: E) -> E {
     let (one, pi, sine) = (x.like(1.0), x.like(PI), x.sin_pi());
-    let exact = || {
+    checked!(-(s * (pi * sine)), [x], [], {
         let is_far = x.abs() - x.like(1e-9);
         let (sine, factor) = (is_far.if_positive(sine, x), is_far.if_positive(one, pi));
         -(s.wide() * pi.wide() * factor.wide() * sine.wide()).narrow()
-    };
-    E::checked(-(s * (pi * sine)), [x], [], exact)
+    })
 }
 
 /// The derivative of the square root y.
@@ -175,18 +187,32 @@ pub(crate) fn atan_slope<E: Real>(s: E, x: E) -> E {
 /// `s c / (a^2 + b^2)` for c = a or b; 0 at the origin.
 #[inline(always)]
 pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
-    let (one, scale) = (a.like(1.0), unless_zero(a.abs().maximum(b.abs())));
-    let (a, b) = (a / scale, b / scale);
-    let square = a * a + b * b;
-    let square = square.if_positive(square, square + one);
-    let exact = || (s.wide() / scale.wide() / square.wide() * (c.wide() / scale.wide())).narrow();
-    E::checked(s / scale / square * (c / scale), [s, c, scale], [], exact)
+    let scale = unless_zero(a.abs().maximum(b.abs()));
+    let square = unit_square(a / scale, b / scale);
+    checked!(
+        s / scale / square * (c / scale),
+        [s, c, scale],
+        [],
+        (s.wide() / scale.wide() / square.wide() * (c.wide() / scale.wide())).narrow()
+    )
 }
 
-/// The derivative `a / y` of the length y of a vector by its component a; 0 at the origin.
+/// The derivative `a / y` of the length y of the vector (a, b) by a; 0 at the origin. A length that is a subnormal number
+/// has lost digits.
 #[inline(always)]
-pub(crate) fn length_slope<E: Real>(s: E, a: E, y: E) -> E {
-    product_over(s, a, unless_zero(y))
+pub(crate) fn length_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
+    let y = unless_zero(y);
+    checked!(s * a / y, [s, a, y], [], {
+        let scale = unless_zero(a.abs().maximum(b.abs()));
+        (s.wide() * (a.wide() / scale.wide()) / unit_square(a / scale, b / scale).sqrt().wide()).narrow()
+    })
+}
+
+/// `a^2 + b^2` of a vector whose larger component is 1; 1 for the zero vector.
+#[inline(always)]
+fn unit_square<E: Real>(a: E, b: E) -> E {
+    let square = a * a + b * b;
+    square.if_positive(square, square + a.like(1.0))
 }
 
 /// `x`, which is not negative, and infinity for 0: a quotient by it is 0, and so are its derivatives.
@@ -198,19 +224,19 @@ fn unless_zero<E: Real>(x: E) -> E {
 /// `s a / b`.
 #[inline(always)]
 pub(crate) fn product_over<E: Real>(s: E, a: E, b: E) -> E {
-    E::checked(s * a / b, [s, a, b], [], || (s.wide() * a.wide() / b.wide()).narrow())
+    checked!(s * a / b, [s, a, b], [], (s.wide() * a.wide() / b.wide()).narrow())
 }
 
 /// `s a / b^2`.
 #[inline(always)]
 pub(crate) fn over_square<E: Real>(s: E, a: E, b: E) -> E {
-    E::checked(s / b * (a / b), [s, a, b], [], || (s.wide() / b.wide() * (a.wide() / b.wide())).narrow())
+    checked!(s / b * (a / b), [s, a, b], [], (s.wide() / b.wide() * (a.wide() / b.wide())).narrow())
 }
 
 /// `s floor(a / b)`, from the remainder y.
 #[inline(always)]
 pub(crate) fn multiple<E: Real>(s: E, a: E, b: E, y: E) -> E {
-    E::checked(s * ((a - y) / b).round(), [s, a, b], [], || {
+    checked!(s * ((a - y) / b).round(), [s, a, b], [], {
         let [difference, scale] = scaled_difference(a, y);
         let quotient = difference.wide() / (b.wide() * scale.wide());
         // A rounded quotient is constant also for further derivatives; a large one is too large for rounding.
@@ -234,13 +260,15 @@ pub(crate) fn powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
     let factor = x.like(f64::from(n));
     match n {
         1 => s,
-        2 => s * (x * factor),
-        3 => E::checked(s * x * x * factor, [s, x], [], || (s.wide() * x.wide() * x.wide() * factor.wide()).narrow()),
-        4 => {
-            let exact = || (s.wide() * x.wide() * x.wide() * x.wide() * factor.wide()).narrow();
-            E::checked(s * x * x * x * factor, [s, x], [], exact)
-        }
-        -1 => -E::checked(s / x / x, [s, x], [], || (s.wide() / x.wide() / x.wide()).narrow()),
+        2 => s * x * factor,
+        3 => checked!(s * x * x * factor, [s, x], [], (s.wide() * x.wide() * x.wide() * factor.wide()).narrow()),
+        4 => checked!(
+            s * x * x * x * factor,
+            [s, x],
+            [],
+            (s.wide() * x.wide() * x.wide() * x.wide() * factor.wide()).narrow()
+        ),
+        -1 => -checked!(s / x / x, [s, x], [], (s.wide() / x.wide() / x.wide()).narrow()),
         _ => any_powi_slope(s, x, n),
     }
 }
@@ -249,9 +277,13 @@ pub(crate) fn powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
 #[inline(always)]
 pub(crate) fn any_powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
     let (factor, power) = (x.like(f64::from(n)), x.powi(n.saturating_sub(1)));
-    let exact = || (s.wide() * factor.wide() * E::Wide::powi(x, n.saturating_sub(1))).narrow();
     // At 0 the quick product is right.
-    E::checked(s * (factor * power), [], [x.abs().if_positive(power, x.like(1.0))], exact)
+    checked!(
+        s * (factor * power),
+        [],
+        [x.abs().if_positive(power, x.like(1.0))],
+        (s.wide() * factor.wide() * E::Wide::powi(x, n.saturating_sub(1))).narrow()
+    )
 }
 
 /// The derivative of y = a^b by a.
@@ -265,13 +297,12 @@ pub(crate) fn base_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let less = a.pow(b - one);
     let is_exact = (b - one) * (b.like(1e6) - b);
     let power = is_exact.if_positive(less, y / base);
-    let exact = || {
-        let y = is_ordinary.if_positive(y, one);
-        (s.wide() * b.wide() * E::Wide::pow(base, b, y) / base.wide()).narrow()
-    };
     // A zero base has its limit, and a subnormal y has lost digits.
     let factors = [is_ordinary.if_positive(power, one), is_exact.if_positive(one, is_ordinary.if_positive(y, one))];
-    let full = E::checked(s * (b * power), [b], factors, exact);
+    let full = checked!(s * (b * power), [b], factors, {
+        let y = is_ordinary.if_positive(y, one);
+        (s.wide() * b.wide() * E::Wide::pow(base, b, y) / base.wide()).narrow()
+    });
     // At an infinite or a zero base; 0 where both are 0, and NaN where one is.
     let limit = (a.abs() + b.abs()).if_positive(s * (b * less), (a + b) * zero);
     is_ordinary.if_positive(full, limit)
@@ -283,9 +314,8 @@ pub(crate) fn exponent_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let (zero, one, size) = (a.like(0.0), a.like(1.0), a.abs());
     // A logarithm that is finite where it is not chosen, or the next derivative would be NaN.
     let ln = size.if_positive(a, one).ln();
-    let full = E::checked(s * (y * ln), [], [size.if_positive(y, one)], || {
-        (s.wide() * E::Wide::pow(a, b, y) * ln.wide()).narrow()
-    });
+    let full =
+        checked!(s * (y * ln), [], [size.if_positive(y, one)], (s.wide() * E::Wide::pow(a, b, y) * ln.wide()).narrow());
     let at_zero = s * (-b).if_positive(y * size.ln(), y * zero + a * zero);
     size.if_positive(full, at_zero)
 }

@@ -102,7 +102,7 @@ PEERS = {
     "smooth_l1_1.5": (torch_smooth(1.5), jax_smooth(1.5)),
     "smooth_l1_2^100": (torch_smooth(BIG), jax_smooth(BIG)),
     "smooth_l1_2^-100": (torch_smooth(SMALL), jax_smooth(SMALL)),
-    "bce_with_logits": (lambda a, b: F.binary_cross_entropy_with_logits(a, b, reduction="none"), jax_bce),
+    "binary_cross_entropy_with_logits": (lambda a, b: F.binary_cross_entropy_with_logits(a, b, reduction="none"), jax_bce),
 }
 for n in (3, 4, 5, 12, -1, -2, -7):
     PEERS[f"powi_{n}"] = (lambda x, n=n: x**n, lambda x, n=n: x**n)

@@ -74,6 +74,11 @@ impl Entry {
         self
     }
 
+    /// Whether the operation is a [`Formula`].
+    pub fn is_elementwise(&self) -> bool {
+        self.dual.is_some()
+    }
+
     /// Marks the operation as linear. The checks then verify linearity too.
     pub fn linear(self) -> Self {
         Entry { linear: true, ..self }
@@ -190,6 +195,7 @@ fn reductions() -> Vec<Entry> {
         Entry::new(variance(&[1, 3, 1], 0.0)).sample(&[&[2, 3, 4]]).sample(&[&[5, 3, 1]]),
         Entry::new(variance(&[], 0.0)).sample(&[&[]]),
         Entry::new(variance(&[0, 1], 0.0)).sample(&[&[0, 4]]),
+        Entry::examined(moments::Ratio),
         Entry::new(moments::Deviation(variance(&[2, 1], 1.0))).sample(&[&[2, 5]]).sample(&[&[2, 40]]),
         Entry::new(moments::Deviation(variance(&[1, 3, 1], 0.0))).sample(&[&[2, 3, 4]]),
         Entry::new(moments::Norm { shape: shape(&[2, 1]) }).sample(&[&[2, 5]]).sample(&[&[2, 40]]),

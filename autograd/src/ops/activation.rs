@@ -1,7 +1,7 @@
 //! Activation functions.
 
 use crate::cases::INF;
-use crate::slopes::{at_least, at_most, bell, near_sigmoid, wide_bell, wide_sigmoid};
+use crate::slopes::{at_least, at_most, bell, checked, near_sigmoid, wide_bell, wide_sigmoid};
 use crate::{Cases, Formula, Var};
 use raygrad_tensor::{Real, Scalar, Wide};
 use std::f64::consts::{FRAC_1_SQRT_2, FRAC_2_SQRT_PI};
@@ -118,8 +118,7 @@ impl Formula<1> for Elu {
         let zero = x.like(0.0);
         let (below, alpha) = (x.if_positive(zero, x), x.if_positive(x.like(1.0), x.like(self.alpha)));
         let y = below.exp();
-        let exact = || (g.wide() * E::Wide::exp(below, zero) * alpha.wide()).narrow();
-        [E::checked(g * (y * alpha), [], [y, alpha], exact)]
+        [checked!(g * (y * alpha), [], [y, alpha], (g.wide() * E::Wide::exp(below, zero) * alpha.wide()).narrow())]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
@@ -143,18 +142,17 @@ impl Formula<1> for Gelu {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let x = at_least(x, -FAR);
         let share = x.normal_cdf();
-        E::checked(x * share, [x], [share], || (x.wide() * E::Wide::normal_cdf(x)).narrow())
+        checked!(x * share, [x], [share], (x.wide() * E::Wide::normal_cdf(x)).narrow())
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
         let x = at_most(at_least(x, -FAR), FAR);
         let peak = x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2);
         let (share, density) = (x.normal_cdf(), peak * bell(x, x, -0.5));
-        let exact = || {
+        [checked!(g * (share + density), [], [share], {
             let share = (g.wide() * E::Wide::normal_cdf(x)).narrow();
             share + (g.wide() * (peak * x).wide() * wide_bell(x, -0.5)).narrow()
-        };
-        [E::checked(g * (share + density), [density], [share], exact)]
+        })]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at(
@@ -177,7 +175,7 @@ impl Formula<1> for GeluTanh {
         let x = at_least(x, -FAR);
         let [u, low] = gelu_argument(at_most(x, FAR));
         let share = near_sigmoid(u, low);
-        E::checked(x * share, [x], [share], || (x.wide() * E::Wide::sigmoid(u, low)).narrow())
+        checked!(x * share, [x], [share], (x.wide() * E::Wide::sigmoid(u, low)).narrow())
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
@@ -186,11 +184,10 @@ impl Formula<1> for GeluTanh {
         let share = near_sigmoid(u, low);
         let slope = x * (x.like(GELU_SCALE) + x.like(3.0 * GELU_SCALE * GELU_CUBIC) * (x * x));
         let density = share * near_sigmoid(-u, -low);
-        let exact = || {
+        [checked!(g * (share + density * slope), [], [share], {
             let share = g.wide() * E::Wide::sigmoid(u, low);
             share.narrow() + (share * E::Wide::sigmoid(-u, -low) * slope.wide()).narrow()
-        };
-        [E::checked(g * (share + density * slope), [slope], [share, density], exact)]
+        })]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at([1e30], 1e30, [1.0]);
@@ -209,18 +206,17 @@ impl Formula<1> for Silu {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let x = at_least(x, -FAR);
         let share = x.sigmoid();
-        E::checked(x * share, [x], [share], || (x.wide() * wide_sigmoid(x)).narrow())
+        checked!(x * share, [x], [share], (x.wide() * wide_sigmoid(x)).narrow())
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
         let x = at_most(at_least(x, -FAR), FAR);
         let share = x.sigmoid();
         let density = share * (-x).sigmoid();
-        let exact = || {
+        [checked!(g * (share + x * density), [], [share], {
             let share = g.wide() * wide_sigmoid(x);
             share.narrow() + (share * wide_sigmoid(-x) * x.wide()).narrow()
-        };
-        [E::checked(g * (share + x * density), [x], [share, density], exact)]
+        })]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]);

@@ -1,7 +1,7 @@
 //! Exponentials, logarithms, square roots and the error function.
 
 use crate::cases::INF;
-use crate::slopes::{corrected_sigmoid, exp_slope, exp2_slope, sqrt_slope};
+use crate::slopes::{checked, corrected_sigmoid, exp_slope, exp2_slope, sqrt_slope};
 use crate::{Cases, Formula};
 use raygrad_tensor::{Real, Wide};
 use std::f64::consts::{FRAC_1_SQRT_2, FRAC_2_SQRT_PI, LN_2, LOG2_E};
@@ -133,8 +133,12 @@ impl Formula<1> for Rsqrt {
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
         let half = y.like(-0.5);
-        let exact = || (g.wide() * y.wide() * y.wide() * (y.wide() * half.wide())).narrow();
-        [E::checked(g * y * y * (y * half), [g], [], exact)]
+        [checked!(
+            g * y * y * (y * half),
+            [g],
+            [],
+            (g.wide() * y.wide() * y.wide() * (y.wide() * half.wide())).narrow()
+        )]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], INF, [-INF]).at([4.0], 0.5, [-0.0625]).at([INF], 0.0, [0.0]);

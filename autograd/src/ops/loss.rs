@@ -2,7 +2,7 @@
 
 use crate::cases::INF;
 use crate::error::ensure;
-use crate::slopes::{product_over, scaled_difference, softplus_slope};
+use crate::slopes::{checked, product_over, scaled_difference, softplus_slope};
 use crate::{Cases, Formula, Grads, Op, Operand, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
 use raygrad_tensor::{Indices, Pool, Real, Scalar, Shape, Tensor};
@@ -53,7 +53,7 @@ impl Formula<2> for Huber {
         let r = a - b;
         // With m, the smaller of |r| and delta, both are m (|r| - m / 2).
         let bounded = (r.abs() - delta).if_positive(delta, r.abs());
-        E::checked(bounded * (r.abs() - half * bounded), [r], [], || {
+        checked!(bounded * (r.abs() - half * bounded), [r], [], {
             let [scaled, scale] = scaled_difference(a, b);
             bounded * (scaled.abs() - half * bounded * scale) / scale
         })
@@ -90,7 +90,10 @@ impl Formula<2> for SmoothL1 {
         let (beta, width) = (a.like(self.beta), a.like(self.width()));
         let r = a - b;
         let near = half * product_over(r, r, width);
-        let far = r.abs() - half * beta;
+        let far = checked!(r.abs() - half * beta, [r], [], {
+            let [scaled, scale] = scaled_difference(a, b);
+            (scaled.abs() - half * beta * scale) / scale
+        });
         (beta - r.abs()).if_positive(near, far)
     }
     #[inline(always)]

@@ -1,8 +1,37 @@
 //! Variance, standard deviation and norms.
 
-use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::cases::INF;
+use crate::slopes::{checked, product_over};
+use crate::{Axes, Cases, Formula, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::scale::powers;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, norm_to, variance_to};
+use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, Wide, broadcast_shape, norm_to, variance_to};
+
+/// y = g a / b, where a part of it may be out of range.
+#[derive(Clone, Copy)]
+pub struct Ratio;
+impl Formula<3> for Ratio {
+    const NAME: &'static str = "ratio";
+    const WIDE_VALUE: bool = true;
+    const WIDE_GRADIENT: bool = true;
+    #[inline(always)]
+    fn f<E: Real>(&self, [g, a, b]: [E; 3]) -> E {
+        product_over(g, a, b)
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, s: E, [g, a, b]: [E; 3], _y: E) -> [E; 3] {
+        let db = -checked!(
+            s * g / b * (a / b),
+            [s, g, a, b],
+            [],
+            (s.wide() * g.wide() / b.wide() * (a.wide() / b.wide())).narrow()
+        );
+        [product_over(s, a, b), product_over(s, g, b), db]
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).domain(-3.0..3.0).domain(0.5..3.0);
+        c.at([1e30, 1e20, 1e30], 1e20, [1e-10, 1.0, -1e-10]).at([1.0, 2.0, INF], 0.0, [0.0, 0.0, 0.0]);
+    }
+}
 
 fn check_kept(x: &[usize], to: &[usize]) -> Result<Shape, ShapeError> {
     match broadcast_shape(&[x, to]) {
@@ -30,10 +59,10 @@ pub struct Deviation(
 );
 
 impl Variance {
-    /// `1 / (n - correction)` for an input of shape `x`.
-    fn share(&self, x: &[usize]) -> f64 {
+    /// `n - correction` for an input of shape `x`.
+    fn divisor(&self, x: &[usize]) -> f64 {
         let [from, to] = [x, &self.shape].map(|shape| shape.iter().product::<usize>() as f64);
-        1.0 / (from / to - self.correction).max(0.0)
+        (from / to - self.correction).max(0.0)
     }
 }
 
@@ -51,7 +80,8 @@ impl<T: Scalar> Op<T> for Variance {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(cx.x(0).centred(&self.shape) * (cx.g() * (2.0 * self.share(cx.shape(0)))))
+        let half = cx.g().constant(0.5 * self.divisor(cx.shape(0)));
+        Grads::one(Ratio.on([cx.g(), &cx.x(0).centred(&self.shape), &half]))
     }
 }
 
@@ -74,19 +104,17 @@ impl<T: Scalar> Op<T> for Deviation {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (shape, x, y) = (&self.0.shape, cx.x(0), cx.y());
-        let share = cx.g() * self.0.share(cx.shape(0));
-        let quotient = |y: &Var<'t, T>| &share / unless_zero(y);
-        let plain = quotient(&y);
-        let is_safe = |x: T| (1e-30..1e30).contains(&x.to_f64().abs());
-        let [values, sizes, shares] = [&plain, &y, &share].map(|x| x.value().as_slice());
-        let is_plain =
-            |i: usize| sizes[i] == T::ZERO || is_safe(sizes[i]) && (shares[i] == T::ZERO || is_safe(values[i]));
-        if (0..sizes.len()).all(is_plain) {
-            return Grads::one(x.centred(shape) * plain);
+        let divisor = self.0.divisor(cx.shape(0));
+        let quotient =
+            |x: Var<'t, T>, y: Var<'t, T>| Ratio.on([cx.g(), &x.centred(shape), &(unless_zero(&y) * divisor)]);
+        // Where deviations or their multiples may be out of range, in units of the deviation, rounded to a power of two. It
+        // cancels, so it is a constant.
+        let is_safe = |y: &T| y.to_f64() == 0.0 || (1e-25..1e25).contains(&y.to_f64());
+        if y.value().as_slice().iter().all(is_safe) {
+            return Grads::one(quotient(x, y));
         }
-        // In units of the deviation, rounded to a power of two. It cancels, so it is a constant.
         let down = cx.constant(y.value().map(|y| powers(y)[0]));
-        Grads::one((x * &down).centred(shape) * quotient(&(y * down)))
+        Grads::one(quotient(x * &down, y * down))
     }
 }
 
@@ -121,8 +149,7 @@ impl<T: Scalar> Op<T> for Norm {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        // x / y first: g / y may overflow where the quotient is of order 1.
-        Grads::one(cx.x(0) / unless_zero(&cx.y()) * cx.g())
+        Grads::one(Ratio.on([cx.g(), &cx.x(0), &unless_zero(&cx.y())]))
     }
 }
 

@@ -143,20 +143,20 @@ fn split(x: f64) -> (f64, i64) {
 
 /// A number `factor * 2^exponent` of any size. The exponent stays 0 as long as numbers are in the middle of f64's range.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Wide {
+pub(super) struct Unbounded {
     /// Between 2^-400 and 2^400, unless it is 0 or not finite.
     factor: f64,
     exponent: i64,
 }
 
-impl From<f64> for Wide {
+impl From<f64> for Unbounded {
     #[inline(always)]
     fn from(x: f64) -> Self {
-        Wide { factor: 1.0, exponent: 0 }.times(x)
+        Unbounded { factor: 1.0, exponent: 0 }.times(x)
     }
 }
 
-impl Wide {
+impl Unbounded {
     #[inline(always)]
     fn is_in_the_middle(x: f64) -> bool {
         const END: f64 = f64::from_bits((1023 + 400) << 52);
@@ -167,31 +167,31 @@ impl Wide {
     #[inline(always)]
     pub fn times(self, x: f64) -> Self {
         let factor = self.factor * x;
-        if Wide::is_in_the_middle(factor) { Wide { factor, ..self } } else { self.times_any(x) }
+        if Unbounded::is_in_the_middle(factor) { Unbounded { factor, ..self } } else { self.times_any(x) }
     }
 
     #[inline(never)]
     fn times_any(self, x: f64) -> Self {
         if self.factor == 0.0 || x == 0.0 || !self.factor.is_finite() || !x.is_finite() {
-            return Wide { factor: self.factor * x, exponent: 0 };
+            return Unbounded { factor: self.factor * x, exponent: 0 };
         }
         let ((a, up), (b, up_too)) = (split(self.factor), split(x));
-        Wide { factor: a * b, exponent: self.exponent + up + up_too }
+        Unbounded { factor: a * b, exponent: self.exponent + up + up_too }
     }
 
     /// The product of two.
     #[inline(always)]
     pub fn product(self, other: Self) -> Self {
         let product = self.times(other.factor);
-        Wide { exponent: product.exponent + other.exponent, ..product }
+        Unbounded { exponent: product.exponent + other.exponent, ..product }
     }
 
     /// The sum.
     #[inline(always)]
     pub fn plus(self, other: Self) -> Self {
         let factor = self.factor + other.factor;
-        if self.exponent == other.exponent && Wide::is_in_the_middle(factor) {
-            Wide { factor, ..self }
+        if self.exponent == other.exponent && Unbounded::is_in_the_middle(factor) {
+            Unbounded { factor, ..self }
         } else {
             self.plus_any(other)
         }
@@ -201,7 +201,7 @@ impl Wide {
     fn plus_any(self, other: Self) -> Self {
         let is_special = |x: Self| x.factor == 0.0 || !x.factor.is_finite();
         match (is_special(self), is_special(other)) {
-            (true, true) => return Wide { factor: self.factor + other.factor, exponent: 0 },
+            (true, true) => return Unbounded { factor: self.factor + other.factor, exponent: 0 },
             (true, false) => return if self.factor == 0.0 { other } else { self },
             (false, true) => return if other.factor == 0.0 { self } else { other },
             (false, false) => {}
@@ -212,7 +212,7 @@ impl Wide {
         });
         let most = up.max(up_too);
         let sum = a * power_of_two(up - most) + b * power_of_two(up_too - most);
-        Wide { factor: sum, exponent: most }
+        Unbounded { factor: sum, exponent: most }
     }
 
     /// The number in f64.

@@ -1,6 +1,6 @@
 //! Cumulative sums and products, and the recurrence in their derivatives.
 
-use super::product::Wide;
+use super::product::Unbounded;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, simd};
 use std::ops::Range;
@@ -172,7 +172,7 @@ impl Running for f64 {
     }
 }
 
-impl Running for Wide {
+impl Running for Unbounded {
     #[inline(always)]
     fn times(self, x: f64) -> Self {
         self.times(x)
@@ -269,7 +269,7 @@ impl Walk {
 }
 
 /// y = the product of x up to and including each entry; dx = [`CumprodGrad`] of x and g. Products are in f64, or in
-/// [`Wide`] numbers if they leave its range: those in the range of the type are right even if others are not.
+/// [`Unbounded`] numbers if they leave its range: those in the range of the type are right even if others are not.
 #[derive(Clone, Copy)]
 pub struct Cumprod(
     /// The order.
@@ -291,7 +291,7 @@ impl<T: Scalar> Op<T> for Cumprod {
         if self.0.stays_in_range(shape, x) {
             self.0.products::<false, f64, T>(shape, x, y);
         } else if !self.0.products::<true, f64, T>(shape, x, y) {
-            self.0.products::<false, Wide, T>(shape, x, y);
+            self.0.products::<false, Unbounded, T>(shape, x, y);
         }
         out
     }
@@ -333,7 +333,7 @@ impl<T: Scalar> Op<T> for CumprodGrad {
         if T::EPSILON > 1e-10 && self.0.stays_in_range(shape, x) {
             self.0.products_grad::<false, f64, T>(shape, x, g, dx);
         } else if !self.0.products_grad::<true, f64, T>(shape, x, g, dx) {
-            self.0.products_grad::<false, Wide, T>(shape, x, g, dx);
+            self.0.products_grad::<false, Unbounded, T>(shape, x, g, dx);
         }
         out
     }

@@ -197,7 +197,7 @@ impl Formula<2> for Hypot {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], y: E) -> [E; 2] {
-        [length_slope(g, a, y), length_slope(g, b, y)]
+        [length_slope(g, a, b, y), length_slope(g, b, a, y)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.3..3.0).domain_also(-3.0..-0.3).domain(-3.0..3.0);

@@ -79,8 +79,12 @@ fn exponents<T: Scalar>() -> [i32; 2] {
 
 /// Numbers of which the largest is in 1..2: rows of one size, of some sizes, of all, and with zeros.
 fn row(most: usize) -> impl Strategy<Value = Vec<f64>> {
-    let spread = prop_oneof![Just(0_i32), Just(3), Just(30), Just(2200)];
-    (spread, 1..most).prop_flat_map(|(spread, n)| {
+    (1..most).prop_flat_map(row_of)
+}
+
+/// The same, of `n` numbers.
+fn row_of(n: usize) -> impl Strategy<Value = Vec<f64>> {
+    prop_oneof![Just(0_i32), Just(3), Just(30), Just(2200)].prop_flat_map(move |spread| {
         let one = (any::<u64>(), 0..=spread, 0..8_u8).prop_map(move |(bits, below, kind)| {
             let significand = f64::from_bits(bits >> 12 | 1023 << 52);
             match kind {
@@ -113,6 +117,10 @@ fn tensor<T: Scalar>(row: &[f64], exponent: i32) -> Tensor<T> {
 /// Fails if `got` is further than `units` units in the last place from `exact 2^exponent`, or than one subnormal step.
 fn check<T: Scalar>(what: &str, got: T, exact: Double, exponent: i32, units: f64) -> Result<(), TestCaseError> {
     let [low, high] = exponents::<T>();
+    // The oracle itself has no digits below.
+    if exact.0 != 0.0 && exact.0.abs() < 1e-280 {
+        return Ok(());
+    }
     let size = exact.0.abs().log2() + f64::from(exponent);
     let got = got.to_f64();
     if exact.0 == 0.0 || size < f64::from(low) + 1.0 {
@@ -129,6 +137,18 @@ fn check<T: Scalar>(what: &str, got: T, exact: Double, exponent: i32, units: f64
             exact.0
         );
     }
+    Ok(())
+}
+
+/// Fails if `got` is further from `exact 2^exponent` than `units T::EPSILON 2^exponent` and some subnormal steps.
+fn within<T: Scalar>(what: &str, got: T, exact: Double, exponent: i32, units: f64) -> Result<(), TestCaseError> {
+    let [low, high] = exponents::<T>();
+    if exact.0.abs().log2() + f64::from(exponent) >= f64::from(high) {
+        return Ok(());
+    }
+    let error = (Double(lifted(got.to_f64(), -exponent), 0.0) - exact).0.abs();
+    let bound = T::EPSILON * units + lifted(4.0 * T::EPSILON, low - exponent);
+    prop_assert!(error <= bound, "{what} in {}: {:e} for {:e} 2^{exponent}", T::NAME, got.to_f64(), exact.0);
     Ok(())
 }
 
@@ -150,9 +170,12 @@ fn views<'t, T: Scalar>(x: &Var<'t, T>) -> Vec<(&'static str, Var<'t, T>, isize)
     ]
 }
 
-/// Value and gradient of `std`, `norm`, `var`, `mean` and `normalize` of a row.
-fn reductions<T: Scalar>(row: &[f64], place: f64) -> Result<(), TestCaseError> {
+/// Value and gradient of `std`, `norm`, `var`, `mean` and `normalize` of a row, for an incoming gradient of any size.
+fn reductions<T: Scalar>(row: &[f64], place: f64, size: f64) -> Result<(), TestCaseError> {
     let (row, exponent) = placed::<T>(row, place);
+    let [low, high] = exponents::<T>();
+    let power = low + (size * f64::from(high - low)) as i32;
+    let g = Double(-1.5, 0.0);
     let n = row.len() as f64;
     let tape = Tape::<T>::new();
     let x = tape.leaf(tensor(&row, exponent));
@@ -181,29 +204,33 @@ fn reductions<T: Scalar>(row: &[f64], place: f64) -> Result<(), TestCaseError> {
             let error = (Double(lifted(y.to_f64(), -exponent), 0.0) - mean).0.abs();
             prop_assert!(error <= bound, "{}: {y:e} for {mean:?} 2^{exponent}", what("mean"), y = y.to_f64());
         }
-        // Gradients of order 1, whatever the size of the row.
-        let gradient = |y: Var<'_, T>| y.sum().grad(&[&x]).remove(0).to_vec();
+        let gradient = |y: Var<'_, T>| {
+            let g = x.tape().constant(Tensor::full(y.shape(), T::from_f64(lifted(g.0, power))));
+            y.vjp(&g, &[&x]).remove(0).value().to_vec()
+        };
         let along = |i: usize| if x.shape().len() == 1 || axis == 1 { i % row.len() } else { i / x.shape()[1] };
         let flipped = name.starts_with("reversed");
         let index = |i: usize| if flipped { row.len() - 1 - along(i) } else { along(i) };
         // A size of subnormal numbers has few digits, and so have quotients by it.
-        let [low, _] = exponents::<T>();
         let digits = |size: Double| lifted(T::EPSILON, low - exponent) / size.0 / T::EPSILON;
         let is_in_range = T::from_f64(lifted(length.0, exponent)).is_finite();
         if length.0 > 0.0 && digits(length) < 1e3 && is_in_range {
             for (i, dx) in gradient(x.norm_over(axis)).into_iter().enumerate() {
-                let exact = Double(row[index(i)], 0.0).over(length.0);
-                check(&what("gradient of norm"), dx, exact, 0, 8.0 + 2.0 * digits(length))?;
+                let exact = g * Double(row[index(i)], 0.0).over(length.0);
+                check(&what("gradient of norm"), dx, exact, power, 8.0 + 2.0 * digits(length))?;
             }
         }
         if deviation.0 > 16.0 * T::EPSILON * largest && digits(deviation) < 1e3 {
             for (i, dx) in gradient(x.std_over(axis, 0)).into_iter().enumerate() {
-                let exact = apart[index(i)].over(deviation.0).over(n);
+                let exact = g * apart[index(i)].over(deviation.0).over(n);
                 // Deviations are exact to the digits of the mean.
-                let error = (dx.to_f64() - exact.0).abs();
-                let bound = 16.0 * T::EPSILON * (1.0 + largest / deviation.0 + digits(deviation)) / n;
-                prop_assert!(error <= bound, "{}: {:e} for {:e}", what("gradient of std"), dx.to_f64(), exact.0);
+                let relative = 16.0 * (1.0 + largest / deviation.0 + digits(deviation)) / n;
+                within(&what("gradient of std"), dx, exact, power, relative)?;
             }
+        }
+        for (i, dx) in gradient(x.var_over(axis, 0)).into_iter().enumerate() {
+            let exact = g * apart[index(i)].over(0.5 * n);
+            within(&what("gradient of var"), dx, exact, power + exponent, 32.0 * largest / n)?;
         }
     }
     for (i, &y) in x.normalize().value().as_slice().iter().enumerate() {
@@ -245,6 +272,52 @@ fn layer_norms<T: Scalar>(row: &[f64], place: f64, epsilon: Option<i32>) -> Resu
         for grad in [weighted.grad(&[&x]).remove(0), weighted.grad_graph(&[&x]).remove(0).into_value()] {
             let error = (lifted(grad.as_slice()[0].to_f64(), exponent) / first - 1.0).abs();
             prop_assert!(error <= 256.0 * relative, "gradient of layer_norm at 2^{exponent}: {error:e} off");
+        }
+    }
+    Ok(())
+}
+
+/// Each line of a matrix has the value and the gradient, to the bit, that it has among copies of itself.
+fn neighbours<T: Scalar>(lines: &[(Vec<f64>, f64)]) -> Result<(), TestCaseError> {
+    type Along<T> = for<'t> fn(&Var<'t, T>, isize) -> Var<'t, T>;
+    let functions: [(&str, Along<T>); 10] = [
+        ("norm", |x, axis| x.norm_over(Axes::from(axis).keepdims())),
+        ("std", |x, axis| x.std_over(Axes::from(axis).keepdims(), 0)),
+        ("var", |x, axis| x.var_over(Axes::from(axis).keepdims(), 0)),
+        ("mean", |x, axis| x.mean_over(Axes::from(axis).keepdims())),
+        ("logsumexp", |x, axis| x.logsumexp_over(Axes::from(axis).keepdims())),
+        ("prod", |x, axis| x.prod_over(Axes::from(axis).keepdims())),
+        ("softmax", |x, axis| x.softmax(axis)),
+        ("log_softmax", |x, axis| x.log_softmax(axis)),
+        ("cumsum", |x, axis| x.cumsum(axis)),
+        ("cumprod", |x, axis| x.cumprod(axis)),
+    ];
+    let lines: Vec<_> = lines.iter().map(|(line, place)| placed::<T>(line, *place)).collect();
+    let (k, n) = (lines.len(), lines[0].0.len());
+    for axis in [0, 1] {
+        let matrix = |line: &dyn Fn(usize) -> usize| {
+            let at = |i: usize| if axis == 0 { (i % k, i / k) } else { (i / n, i % n) };
+            let value = |i: usize| {
+                let (row, exponent) = &lines[line(at(i).0)];
+                T::from_f64(lifted(row[at(i).1], *exponent))
+            };
+            Tensor::from_fn(&if axis == 0 { [n, k] } else { [k, n] }, value)
+        };
+        for (name, f) in functions {
+            // Value and gradient of the line `which`.
+            let line = |x: Tensor<T>, which: isize| {
+                let tape = Tape::<T>::new();
+                let x = tape.leaf(x);
+                let y = f(&x, axis);
+                let dx = tape.no_grad(|| y.vjp(&tape.constant(Tensor::ones(y.shape())), &[&x])).remove(0);
+                [y, dx].map(|x| x.slice_axis(1 - axis, which..=which).value().to_vec())
+            };
+            for which in 0..k {
+                let (among, alone) = (line(matrix(&|i| i), which as isize), line(matrix(&|_| which), which as isize));
+                let same = |(a, b): (&T, &T)| a == b || a.to_f64().is_nan() && b.to_f64().is_nan();
+                let all = among.iter().flatten().zip(alone.iter().flatten()).all(same);
+                prop_assert!(all, "{name} of line {which} of axis {axis} in {}: {among:?}, {alone:?}", T::NAME);
+            }
         }
     }
     Ok(())
@@ -447,9 +520,19 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 1000, ..ProptestConfig::default() })]
 
     #[test]
-    fn reductions_of_every_binade_agree_with_an_exact_oracle(row in row(40), place in 0.0..1.0) {
-        reductions::<f32>(&row, place)?;
-        reductions::<f64>(&row, place)?;
+    fn reductions_of_every_binade_agree_with_an_exact_oracle(
+        row in row(40), place in 0.0..1.0, size in 0.0..1.0
+    ) {
+        reductions::<f32>(&row, place, size)?;
+        reductions::<f64>(&row, place, size)?;
+    }
+
+    #[test]
+    fn no_line_depends_on_its_neighbours(
+        lines in (1_usize..40).prop_flat_map(|n| prop::collection::vec((row_of(n), 0.0..1.0), 2..5))
+    ) {
+        neighbours::<f32>(&lines)?;
+        neighbours::<f64>(&lines)?;
     }
 
     #[test]

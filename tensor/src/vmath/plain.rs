@@ -18,7 +18,7 @@ macro_rules! functions_of {
     ($t:ident) => {
         /// The functions in this precision.
         pub mod $t {
-            use crate::vmath::$t::expm1;
+            use crate::vmath::$t::polynomial;
             use crate::vmath::wide::$t::Wide;
             use crate::Wide as _;
 
@@ -42,14 +42,26 @@ macro_rules! functions_of {
                 $t::round_ties_even(x)
             }
 
-            /// Hyperbolic sine, within 2 ULP. It uses `expm1` up to 2, and beyond half the difference of e^x and e^-x,
-            /// which overflows only if the result does.
+            /// Hyperbolic sine, within 2 ULP. It uses Taylor's series up to 1, and beyond half the difference of e^x and
+            /// e^-x, which overflows only if the result does.
             #[inline(always)]
             pub fn sinh(x: $t) -> $t {
+                /// 1 / (2n + 3)!
+                const TAYLOR: [$t; 9] = [
+                    1.0 / 6.0,
+                    1.0 / 120.0,
+                    1.0 / 5040.0,
+                    1.0 / 362_880.0,
+                    1.0 / 39_916_800.0,
+                    1.0 / 6_227_020_800.0,
+                    1.0 / 1_307_674_368_000.0,
+                    1.0 / 355_687_428_096_000.0,
+                    1.0 / 121_645_100_408_832_000.0,
+                ];
                 let a = $t::abs(x);
-                let t = expm1(a);
+                let square = a * a;
                 let (e, inverse) = exponentials(a);
-                let y = if a < 2.0 { 0.5 * (t + t / (t + 1.0)) } else { e - inverse };
+                let y = if a < 1.0 { (a * square).mul_add(polynomial(square, TAYLOR), a) } else { e - inverse };
                 $t::copysign(y, x)
             }
 

@@ -2,9 +2,11 @@
 //!
 //! `reference/exact.py` computes arguments and values with mpmath, and a test compares them.
 
+use std::array::from_fn;
 use std::cmp::Ordering;
 use std::f64::consts;
 use std::ops::{Add, Div, Mul, Neg, Sub};
+use std::sync::LazyLock;
 
 /// `(high + low) 2^exponent`: the sum of two numbers that do not overlap, with 1 <= |high| < 2. Zero, infinities and NaN
 /// are in `high` alone.
@@ -29,15 +31,31 @@ fn two_sum(a: f64, b: f64) -> (f64, f64) {
 }
 
 /// x 2^n, exact if the result is a normal number.
-fn scaled(x: f64, n: i64) -> f64 {
-    let mut y = x;
-    let mut n = n.clamp(-3000, 3000);
+pub fn scaled(x: f64, n: i64) -> f64 {
+    let (mut y, mut n) = (x, n.clamp(-3000, 3000));
     while n != 0 {
         let step = n.clamp(-1000, 1000);
-        y *= 2.0_f64.powi(step as i32);
+        y *= f64::from_bits(((step + 1023) as u64) << 52);
         n -= step;
     }
     y
+}
+
+/// Reciprocals of whole numbers.
+static RECIPROCALS: LazyLock<[Exact; 256]> = LazyLock::new(|| from_fn(|n| Exact::new(n as f64).recip()));
+
+/// The sum of `first` and of terms that `next` gives from the one before, the reciprocals, and n = 1, 2, ..; until a term
+/// is nothing beside the sum.
+fn series(first: Exact, next: impl Fn(Exact, &[Exact], usize) -> Exact) -> Exact {
+    let (mut sum, mut term) = (first, first);
+    for n in 1..100 {
+        term = next(term, &*RECIPROCALS, n);
+        sum = sum + term;
+        if term.is_zero() || term.exponent < sum.exponent - 110 {
+            break;
+        }
+    }
+    sum
 }
 
 impl Exact {
@@ -139,12 +157,7 @@ impl Exact {
 
     /// Taylor's series of e^x - 1.
     fn expm1_series(self) -> Exact {
-        let (mut sum, mut term) = (self, self);
-        for n in 2..40 {
-            term = term * self / Exact::new(f64::from(n));
-            sum = sum + term;
-        }
-        sum
+        series(self, |term, reciprocals, n| term * self * reciprocals[n + 1])
     }
 
     pub fn expm1(self) -> Exact {
@@ -153,13 +166,12 @@ impl Exact {
 
     /// ln((1 + s) / (1 - s)).
     fn ln_of_ratio(s: Exact) -> Exact {
-        let square = s * s;
-        let (mut sum, mut power) = (s, s);
-        for n in 1..50 {
-            power = power * square;
-            sum = sum + power / Exact::new(f64::from(2 * n + 1));
-        }
-        sum.shifted(1)
+        let (square, two) = (s * s, Exact::new(2.0));
+        // Each term has the factor of the one before.
+        series(s, |term, reciprocals, n| {
+            term * square * (two * Exact::new(n as f64) - Exact::new(1.0)) * reciprocals[2 * n + 1]
+        })
+        .shifted(1)
     }
 
     pub fn ln(self) -> Exact {
@@ -180,15 +192,11 @@ impl Exact {
     /// Sine and cosine of an angle within about pi/4.
     fn sin_cos_series(self) -> [Exact; 2] {
         let square = -(self * self);
-        let (mut sine, mut cosine) = (self, Exact::new(1.0));
-        let (mut odd, mut even) = (self, cosine);
-        for n in 1..16 {
-            let n = 2.0 * f64::from(n);
-            even = even * square / Exact::new(n * (n - 1.0));
-            odd = odd * square / Exact::new(n * (n + 1.0));
-            (sine, cosine) = (sine + odd, cosine + even);
-        }
-        [sine, cosine]
+        [(self, 1), (Exact::new(1.0), 0)].map(|(first, odd)| {
+            series(first, |term, reciprocals, n| {
+                term * square * reciprocals[2 * n - 1 + odd] * reciprocals[2 * n + odd]
+            })
+        })
     }
 
     /// Sine and cosine, turned by n right angles.
@@ -285,11 +293,7 @@ impl Exact {
         }
         // A series of positive terms, 2^n x^(2n + 1) / (2n + 1)!!.
         let twice = self.square().shifted(1);
-        let (mut sum, mut term) = (self, self);
-        for n in 1..90 {
-            term = term * twice / Exact::new(f64::from(2 * n + 1));
-            sum = sum + term;
-        }
+        let sum = series(self, |term, reciprocals, n| term * twice * reciprocals[2 * n + 1]);
         (-self.square()).exp() * sum.shifted(1) / Exact::PI.sqrt()
     }
 
@@ -300,9 +304,9 @@ impl Exact {
         if !(self > Exact::new(2.5)) {
             return Exact::new(1.0) - self.erf();
         }
-        // Laplace's continued fraction, from its end.
+        // Laplace's continued fraction, from its end; it converges faster for larger numbers.
         let mut fraction = self;
-        for n in (1..200).rev() {
+        for n in (1..10 + (1200.0 / self.square().to_f64()) as u32).rev() {
             fraction = self + Exact::new(0.5 * f64::from(n)) / fraction;
         }
         (-self.square()).exp() / (fraction * Exact::PI.sqrt())

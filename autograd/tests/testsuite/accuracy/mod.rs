@@ -2,16 +2,19 @@
 //!
 //! Values and gradients are compared one by one with a reference of 100 bits ([`exact`]). Arguments are drawn from all
 //! bit patterns, close to kinks and borders, and where functions are used; incoming gradients from all bit patterns, and
-//! so that the result is a normal number. `ACCURACY_DRAWS` sets how many, `ACCURACY_ONLY=gelu,tanh` which operations.
-//! `ACCURACY_DUMP` names a folder for arguments and exact results, which `benches/peers/accuracy.py` reads.
+//! so that the result is a normal number. `ACCURACY_DRAWS` sets how many, `ACCURACY_SEED` which, and
+//! `ACCURACY_ONLY=gelu,tanh` for which operations. `ACCURACY_DUMP` names a folder for arguments and exact results, which
+//! `benches/peers/accuracy.py` reads. [`singles`] has many more cases in f32.
 
 mod exact;
 mod operations;
+mod singles;
 
-use exact::Exact;
+use exact::{Exact, scaled};
 use operations::{Operation, Reference, operations};
 use raygrad_autograd::{Scalar, Tape, Tensor, Var};
 use rayon::prelude::*;
+use std::sync::LazyLock;
 
 /// Errors above this many units in the last place are breaches.
 const GATE: f64 = 8.0;
@@ -93,7 +96,29 @@ impl Format {
 /// Random bits (SplitMix64).
 struct Random(u64);
 
+/// The number in the environment variable.
+fn setting(name: &str) -> Option<usize> {
+    std::env::var(name).ok().map(|text| text.parse().unwrap_or_else(|_| panic!("{name}={text} is not a number")))
+}
+
+/// Whether `ACCURACY_ONLY` asks for the operation.
+fn is_asked(name: &str) -> bool {
+    let only = std::env::var("ACCURACY_ONLY").unwrap_or_default();
+    only.is_empty() || only.split(',').any(|part| name.starts_with(part))
+}
+
 impl Random {
+    /// For a case of an operation.
+    fn of(name: &str, case: u64) -> Random {
+        // FNV-1a: every operation has cases of its own.
+        let hash = name
+            .bytes()
+            .fold(0xcbf2_9ce4_8422_2325, |hash: u64, byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3));
+        static SEED: LazyLock<u64> = LazyLock::new(|| setting("ACCURACY_SEED").unwrap_or(0) as u64);
+        let mut random = Random(hash ^ SEED.rotate_left(32));
+        Random(random.bits() ^ case)
+    }
+
     fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let x = (self.0 ^ self.0 >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -102,16 +127,15 @@ impl Random {
     }
 
     fn below(&mut self, n: i64) -> i64 {
-        (self.bits() % n as u64) as i64
+        ((u128::from(self.bits()) * n as u128) >> 64) as i64
     }
 
     /// A number with this exponent, of either sign.
     fn of_exponent<T: Scalar>(&mut self, exponent: i64) -> f64 {
         let fraction = 1.0 + self.bits() as f64 / 2.0_f64.powi(64);
-        let x = Exact::new(fraction).shifted(exponent).to_f64();
-        // Rounded to the type; an overflow is the largest number.
-        let x = T::from_f64(x).to_f64();
-        let x = if x.is_finite() { x } else { Exact::new(1.0).shifted(exponent - 1).to_f64() };
+        // Rounded to the type; instead of an overflow, half of the power of two.
+        let x = T::from_f64(scaled(fraction, exponent)).to_f64();
+        let x = if x.is_finite() { x } else { scaled(1.0, exponent - 1) };
         if self.bits() & 1 == 0 { x } else { -x }
     }
 
@@ -154,7 +178,7 @@ impl Random {
                     26 => 2.0_f64.powi(format.greatest as i32),
                     k => PLACES[k as usize],
                 };
-                let step = 2.0_f64.powi(-(self.below(format.digits + 1)) as i32);
+                let step = scaled(1.0, -self.below(format.digits + 1));
                 let x = T::from_f64(place * (1.0 + step * (self.below(3) - 1) as f64)).to_f64();
                 let x = if x.is_finite() { x } else { place };
                 if self.below(2) == 0 { x } else { -x }
@@ -165,26 +189,24 @@ impl Random {
     /// The same operands; one time in four the second is equal or close to the first.
     fn related<T: Scalar>(&mut self, mut x: Vec<f64>) -> Vec<f64> {
         if x.len() > 1 && self.below(4) == 0 {
-            let step = 2.0_f64.powi(-(self.below(Format::of::<T>().digits + 2)) as i32);
+            let step = scaled(1.0, -self.below(Format::of::<T>().digits + 2));
             let near = T::from_f64(x[0] * (1.0 + step * (self.below(3) - 1) as f64)).to_f64();
             x[1] = if near.is_finite() { near } else { x[0] };
         }
         x
     }
 
-    /// An incoming gradient: of any bits, or so that a gradient is a normal number.
-    fn gradient<T: Scalar>(&mut self, reference: &Reference) -> f64 {
-        let slope = reference.slopes[self.below(reference.slopes.len() as i64) as usize].0;
+    /// An incoming gradient: of any bits, or so that a gradient is a normal number; for the exponents of derivatives.
+    fn gradient<T: Scalar>(&mut self, slopes: &[Option<i64>]) -> f64 {
+        let slope = slopes[self.below(slopes.len() as i64) as usize];
         if self.below(32) == 0 {
             return 0.0;
         }
-        if self.below(2) == 0 || slope.is_zero() || !slope.is_finite() {
-            return self.pattern::<T>();
-        }
+        let Some(slope) = slope.filter(|_| self.below(2) == 1) else { return self.pattern::<T>() };
         let format = Format::of::<T>();
         let lowest = format.least - format.digits;
         let target = lowest + self.below(format.greatest - lowest + 1);
-        self.of_exponent::<T>((target - slope.exponent()).clamp(lowest, format.greatest))
+        self.of_exponent::<T>((target - slope).clamp(lowest, format.greatest))
     }
 }
 
@@ -206,6 +228,17 @@ impl Column {
         self.sum += if error.is_finite() { error } else { 0.0 };
         self.count += 1;
         self.breaches += usize::from(!(error <= gate));
+    }
+
+    /// Both columns as one.
+    fn joined(self, other: Column) -> Column {
+        let (worst, rest) = if other.worst > self.worst || self.count == 0 { (other, self) } else { (self, other) };
+        Column {
+            sum: worst.sum + rest.sum,
+            count: worst.count + rest.count,
+            breaches: worst.breaches + rest.breaches,
+            ..worst
+        }
     }
 }
 
@@ -238,48 +271,76 @@ impl Dump {
     }
 }
 
+/// Cases that are evaluated together, with the same constants.
+fn batch<T: Scalar>(operation: &Operation<T>) -> usize {
+    if operation.constants.is_some() { 1 << 7 } else { 1 << 14 }
+}
+
+/// The constants of a batch, numbers of the type.
+fn constants<T: Scalar>(operation: &Operation<T>, batch: usize) -> [f64; 2] {
+    let mut random = Random::of(operation.name, !(batch as u64));
+    operation.constants.map_or([0.0; 2], |constants| constants([random.argument::<T>(), random.argument::<T>()]))
+}
+
+/// Value and gradients of the operation.
+fn evaluate<T: Scalar>(operation: &Operation<T>, constants: [f64; 2], x: Vec<Vec<T>>, g: Vec<T>) -> Vec<Tensor<T>> {
+    let (tape, n) = (Tape::<T>::new(), g.len());
+    let x: Vec<_> = x.into_iter().map(|x| tape.leaf(Tensor::from_vec(&[n], x))).collect();
+    let y = (operation.function)(&x, constants);
+    let grads = tape.no_grad(|| y.vjp(&tape.constant(Tensor::from_vec(&[n], g)), &x.iter().collect::<Vec<_>>()));
+    [y].into_iter().chain(grads).map(Var::into_value).collect()
+}
+
+/// The results that are compared: exact results and their largest terms, for an incoming gradient. Conventions decide at
+/// a few points, and a derivative is compared where the value is finite.
+fn compared(reference: &Reference, g: f64, value: f64) -> Vec<Option<(Exact, Exact)>> {
+    let g = Exact::new(g);
+    let slopes = reference.slopes.iter().map(|&(slope, term)| {
+        let exact = g * slope;
+        (exact.is_finite() && value.is_finite()).then(|| (exact, g * term))
+    });
+    [reference.value].into_iter().chain(slopes).collect()
+}
+
+/// The limit for errors of the value, or of a gradient.
+fn gate(name: &str, is_gradient: bool) -> f64 {
+    if !is_gradient && FUNCTIONS.contains(&name) { 2.0 } else { GATE }
+}
+
 /// The errors of the value and of the gradient by each operand.
 fn examine<T: Scalar>(operation: &Operation<T>, draws: usize) -> Vec<Column> {
     let mut columns = vec![Column::default(); 1 + operation.operands];
     let (format, mut dump) = (Format::of::<T>(), Dump::new::<T>(operation.name, operation.operands));
-    for (batch, start) in (0..draws).step_by(1 << 14).enumerate() {
-        let n = (draws - start).min(1 << 14);
+    let size = batch(operation);
+    for start in (0..draws).step_by(size) {
+        let n = (draws - start).min(size);
+        let constants = constants(operation, start / size);
         let cases: Vec<(Vec<f64>, Reference, f64)> = (0..n)
             .into_par_iter()
             .map(|i| {
-                let mut random = Random((batch as u64) << 32 | i as u64);
-                random.bits();
+                let mut random = Random::of(operation.name, (start + i) as u64);
                 let x: Vec<f64> = (0..operation.operands).map(|_| random.argument::<T>()).collect();
                 let x = (operation.domain)(random.related::<T>(x));
-                let reference = (operation.reference)(&x);
-                let g = random.gradient::<T>(&reference);
+                let reference = (operation.reference)(&x, constants);
+                let exponent =
+                    |&(slope, _): &(Exact, Exact)| (!slope.is_zero() && slope.is_finite()).then(|| slope.exponent());
+                let g = random.gradient::<T>(&reference.slopes.iter().map(exponent).collect::<Vec<_>>());
                 (x, reference, g)
             })
             .collect();
-        let tape = Tape::<T>::new();
-        let column = |f: &dyn Fn(usize) -> f64| Tensor::from_fn(&[n], |i| T::from_f64(f(i)));
-        let x: Vec<_> = (0..operation.operands).map(|k| tape.leaf(column(&|i| cases[i].0[k]))).collect();
-        let y = (operation.function)(&x);
-        let grads = tape.no_grad(|| y.vjp(&tape.constant(column(&|i| cases[i].2)), &x.iter().collect::<Vec<_>>()));
+        let column = |f: &dyn Fn(usize) -> f64| (0..n).map(|i| T::from_f64(f(i))).collect::<Vec<_>>();
+        let x = (0..operation.operands).map(|k| column(&|i| cases[i].0[k])).collect();
+        let results = evaluate(operation, constants, x, column(&|i| cases[i].2));
         for (i, (x, reference, g)) in cases.iter().enumerate() {
-            let value = y.value().as_slice()[i].to_f64();
+            let got = |k: usize| results[k].as_slice()[i].to_f64();
             dump.numbers(x);
             dump.numbers(&[*g]);
-            let g_exact = Exact::new(*g);
-            let slopes = reference.slopes.iter().map(|&(slope, term)| Some((g_exact * slope, g_exact * term)));
-            let got = grads.iter().map(|grad| grad.value().as_slice()[i].to_f64());
-            for (k, (exact, got)) in
-                [reference.value].into_iter().chain(slopes).zip([value].into_iter().chain(got)).enumerate()
-            {
-                // Conventions decide at a few points, and a derivative is compared where the value is finite.
-                let exact = exact.filter(|(exact, _)| k == 0 || exact.is_finite() && value.is_finite());
-                let is_compared = exact.is_some();
-                let gate = if k == 0 && FUNCTIONS.contains(&operation.name) { 2.0 } else { GATE };
+            for (k, exact) in compared(reference, *g, got(0)).into_iter().enumerate() {
+                let error = exact.map(|(exact, term)| format.error(got(k), exact, term));
                 let (exact, term) = exact.unwrap_or((Exact::ZERO, Exact::ZERO));
-                let error = if is_compared { format.error(got, exact, term) } else { f64::NAN };
-                dump.result(&format, exact, term, error);
-                if is_compared {
-                    columns[k].add(error, gate, || x.iter().copied().chain((k > 0).then_some(*g)).collect());
+                dump.result(&format, exact, term, error.unwrap_or(f64::NAN));
+                if let Some(error) = error {
+                    columns[k].add(error, gate(operation.name, k > 0), || place(x, (k > 0).then_some(*g), constants));
                 }
             }
         }
@@ -287,30 +348,34 @@ fn examine<T: Scalar>(operation: &Operation<T>, draws: usize) -> Vec<Column> {
     columns
 }
 
+/// Arguments, incoming gradient and constants.
+fn place(x: &[f64], g: Option<f64>, constants: [f64; 2]) -> Vec<f64> {
+    x.iter().copied().chain(g).chain(constants.into_iter().filter(|&c| c != 0.0)).collect()
+}
+
 /// Prints a row for each operation and returns the breaches.
 fn check<T: Scalar>(draws: usize) -> Vec<String> {
-    let only = std::env::var("ACCURACY_ONLY").unwrap_or_default();
+    let asked = operations::<T>().into_iter().filter(|operation| is_asked(operation.name));
+    asked.flat_map(|operation| report::<T>(operation.name, examine(&operation, draws), draws / 10)).collect()
+}
+
+/// Prints the columns of an operation, and returns those with breaches or with fewer than `least` results.
+fn report<T: Scalar>(name: &str, columns: Vec<Column>, least: usize) -> Vec<String> {
     let mut failed = vec![];
-    for operation in operations::<T>() {
-        if !only.is_empty() && !only.split(',').any(|name| operation.name.starts_with(name)) {
-            continue;
-        }
-        for (k, column) in examine(&operation, draws).into_iter().enumerate() {
-            let of = if k == 0 { "value".to_string() } else { format!("gradient {k}") };
-            let mean = column.sum / column.count.max(1) as f64;
-            let row = format!(
-                "{:<16} {} {of:<10} {:>9.3} {mean:>7.3} {:>7} of {:>7}  {:e}",
-                operation.name,
-                T::NAME,
-                column.worst,
-                column.breaches,
-                column.count,
-                Places(&column.at),
-            );
-            println!("{row}");
-            if column.breaches > 0 || column.count < draws / 10 {
-                failed.push(row);
-            }
+    for (k, column) in columns.into_iter().enumerate() {
+        let of = if k == 0 { "value".to_string() } else { format!("gradient {k}") };
+        let mean = column.sum / column.count.max(1) as f64;
+        let row = format!(
+            "{name:<16} {} {of:<10} {:>9.3} {mean:>7.3} {:>7} of {:>7}  {:e}",
+            T::NAME,
+            column.worst,
+            column.breaches,
+            column.count,
+            Places(&column.at),
+        );
+        println!("{row}");
+        if column.breaches > 0 || column.count < least {
+            failed.push(row);
         }
     }
     failed
@@ -327,9 +392,20 @@ impl std::fmt::LowerExp for Places<'_> {
 
 #[test]
 fn every_operation_is_within_8_units_in_the_last_place() {
-    let draws = std::env::var("ACCURACY_DRAWS").map_or(2000, |draws| draws.parse().unwrap());
+    let draws = setting("ACCURACY_DRAWS").unwrap_or(2000);
     let failed: Vec<_> = check::<f32>(draws).into_iter().chain(check::<f64>(draws)).collect();
     assert!(failed.is_empty(), "beyond {GATE} units in the last place:\n{}", failed.join("\n"));
+}
+
+#[test]
+fn every_elementwise_operation_is_measured() {
+    // An operation that changes nothing, and one that only gradients use.
+    let not_measured = ["alias", "ratio"];
+    let operations = operations::<f32>();
+    for entry in raygrad_autograd::check::catalogue().iter().filter(|entry| entry.is_elementwise()) {
+        let mut rows = operations.iter().filter(|row| row.name.split(',').next() == Some(entry.name));
+        assert!(rows.next().is_some() || not_measured.contains(&entry.name), "no row for {}", entry.name);
+    }
 }
 
 /// A function of one operand in single precision.

@@ -11,18 +11,21 @@ pub struct Reference {
     pub slopes: Vec<(Exact, Exact)>,
 }
 
-/// An operation of [`Var`] and its reference.
+/// An operation of [`Var`] and its reference. Both have two constants, numbers of the type, which only some operations
+/// use.
 pub struct Operation<T: Scalar> {
     pub name: &'static str,
     pub operands: usize,
     pub function: Function<T>,
     /// Moves arguments into the domain.
     pub domain: fn(Vec<f64>) -> Vec<f64>,
-    pub reference: fn(&[f64]) -> Reference,
+    pub reference: fn(&[f64], [f64; 2]) -> Reference,
+    /// Moves random constants into their domain.
+    pub constants: Option<fn([f64; 2]) -> [f64; 2]>,
 }
 
-/// A function of variables.
-pub type Function<T> = for<'t> fn(&[Var<'t, T>]) -> Var<'t, T>;
+/// A function of variables, with constants.
+pub type Function<T> = for<'t> fn(&[Var<'t, T>], [f64; 2]) -> Var<'t, T>;
 
 /// Results without terms that cancel.
 fn of<const N: usize>(value: Exact, slopes: [Exact; N]) -> Reference {
@@ -105,25 +108,28 @@ fn pair([a, b]: [f64; 2]) -> [Exact; 2] {
 
 macro_rules! rows {
     ($($name:literal: |$v:ident| $function:expr, |$x:ident| $reference:expr;)*) => {
-        vec![$(Operation { name: $name, operands: 1, function: |$v| $function, domain: |x| x, reference: |x| {
+        vec![$(Operation { name: $name, operands: 1, function: |$v, _| $function, domain: |x| x, reference: |x, _| {
             let $x = x[0];
             $reference
-        } }),*]
+        }, constants: None }),*]
     };
 }
 
 macro_rules! pairs {
     ($($name:literal: |$v:ident| $function:expr, |$a:ident, $b:ident| $reference:expr;)*) => {
-        vec![$(Operation { name: $name, operands: 2, function: |$v| $function, domain: |x| x, reference: |x| {
+        vec![$(Operation { name: $name, operands: 2, function: |$v, _| $function, domain: |x| x, reference: |x, _| {
             let [$a, $b] = [x[0], x[1]];
             $reference
-        } }),*]
+        }, constants: None }),*]
     };
 }
 
 /// Every elementwise operation.
 pub fn operations<T: Scalar>() -> Vec<Operation<T>> {
-    [functions(), activations(), powers(), binary(), vec![lerp()], losses()].into_iter().flatten().collect()
+    [functions(), activations(), powers(), binary(), choices(), losses(), with_constants()]
+        .into_iter()
+        .flatten()
+        .collect()
 }
 
 fn functions<T: Scalar>() -> Vec<Operation<T>> {
@@ -181,6 +187,12 @@ fn functions<T: Scalar>() -> Vec<Operation<T>> {
         "cosh": |v| v[0].cosh(), |x| of(Exact::new(x).cosh(), [Exact::new(x).sinh()]);
         "tanh": |v| v[0].tanh(), |x| of(Exact::new(x).tanh(), [Exact::new(x).cosh().square().recip()]);
         "abs": |v| v[0].abs(), |x| of(Exact::new(x.abs()), [if x == 0.0 { Exact::ZERO } else { Exact::new(x.signum()) }]);
+        "sign": |v| v[0].sign(), |x| {
+            of(Exact::new(if x == 0.0 { 0.0 } else { x.signum() }), [Exact::ZERO])
+        };
+        "floor": |v| v[0].floor(), |x| of(Exact::new(x.floor()), [Exact::ZERO]);
+        "ceil": |v| v[0].ceil(), |x| of(Exact::new(x.ceil()), [Exact::ZERO]);
+        "round": |v| v[0].round(), |x| of(Exact::new(x.round_ties_even()), [Exact::ZERO]);
         "reciprocal": |v| v[0].reciprocal(), |x| of(Exact::new(x).recip(), [-Exact::new(x).square().recip()]);
         "affine": |v| v[0].affine(-2.5, 0.75), |x| {
             of(Exact::new(x) * Exact::new(-2.5) + Exact::new(0.75), [Exact::new(-2.5)])
@@ -208,15 +220,9 @@ fn activations<T: Scalar>() -> Vec<Operation<T>> {
             let slope = Exact::new(if x > 0.0 { 1.0 } else { 0.125 });
             of(Exact::new(x) * slope, [slope])
         };
-        "elu": |v| v[0].elu(1.5), |x| {
-            let (alpha, below) = (Exact::new(1.5), Exact::new(x));
-            if x > 0.0 { of(below, [one()]) } else { of(alpha * below.expm1(), [alpha * below.exp()]) }
-        };
+        "elu": |v| v[0].elu(1.5), |x| elu(x, 1.5);
         // Constants whose products with the derivative leave the range.
-        "elu, 2^100": |v| v[0].elu(2.0_f64.powi(100)), |x| {
-            let (alpha, below) = (one().shifted(100), Exact::new(x));
-            if x > 0.0 { of(below, [one()]) } else { of(alpha * below.expm1(), [alpha * below.exp()]) }
-        };
+        "elu, 2^100": |v| v[0].elu(2.0_f64.powi(100)), |x| elu(x, 2.0_f64.powi(100));
         "silu": |v| v[0].silu(), |x| {
             let x = Exact::new(x);
             gated(x, x.sigmoid(), x.sigmoid() * (-x).sigmoid())
@@ -240,6 +246,8 @@ fn powers<T: Scalar>() -> Vec<Operation<T>> {
     }
     rows! {
         "square": |v| v[0].square(), |x| whole(x, 2);
+        "powi, 0": |v| v[0].powi(0), |_x| of(one(), [Exact::ZERO]);
+        "powi, 1": |v| v[0].powi(1), |x| of(Exact::new(x), [one()]);
         "powi, 3": |v| v[0].powi(3), |x| whole(x, 3);
         "powi, 4": |v| v[0].powi(4), |x| whole(x, 4);
         "powi, 5": |v| v[0].powi(5), |x| whole(x, 5);
@@ -247,6 +255,8 @@ fn powers<T: Scalar>() -> Vec<Operation<T>> {
         "powi, -1": |v| v[0].powi(-1), |x| whole(x, -1);
         "powi, -2": |v| v[0].powi(-2), |x| whole(x, -2);
         "powi, -7": |v| v[0].powi(-7), |x| whole(x, -7);
+        "powf, 0": |v| v[0].powf(0.0), |_x| of(one(), [Exact::ZERO]);
+        "powf, 1": |v| v[0].powf(1.0), |x| of(Exact::new(x), [one()]);
         "powf, 0.5": |v| v[0].powf(0.5), |x| constant_power(x, 0.5);
         "powf, 1.75": |v| v[0].powf(1.75), |x| constant_power(x, 1.75);
         "powf, 2": |v| v[0].powf(2.0), |x| constant_power(x, 2.0);
@@ -316,14 +326,84 @@ fn binary<T: Scalar>() -> Vec<Operation<T>> {
     }
 }
 
-fn lerp<T: Scalar>() -> Operation<T> {
-    let reference = |x: &[f64]| {
+fn choices<T: Scalar>() -> Vec<Operation<T>> {
+    let row = |name, function, reference| Operation {
+        name,
+        operands: 3,
+        function,
+        domain: |x| x,
+        reference,
+        constants: None,
+    };
+    let if_positive: Function<T> = |v, _| v[0].if_positive(&v[1], &v[2]);
+    let where_: Function<T> = |v, _| v[1].where_(&v[0].value().gt(T::ZERO), &v[2]);
+    let choice = |x: &[f64], _| {
+        let [yes, no] = [x[1], x[2]].map(Exact::new);
+        if x[0] > 0.0 { of(yes, [Exact::ZERO, one(), Exact::ZERO]) } else { of(no, [Exact::ZERO, Exact::ZERO, one()]) }
+    };
+    let lerp = |x: &[f64], _| {
         let [a, b, w] = [x[0], x[1], x[2]].map(Exact::new);
         // From the nearer end, as documented: these are the terms that may cancel.
         let (from, share) = if w > Exact::new(0.5) { (b, w - one()) } else { (a, w) };
         with_terms(sum(from, share * (b - a)), [one() - w, w, b - a].map(|slope| (slope, slope)))
     };
-    Operation { name: "lerp", operands: 3, function: |v| v[0].lerp(&v[1], &v[2]), domain: |x| x, reference }
+    vec![
+        row("if_positive", if_positive, choice),
+        row("where", where_, choice),
+        row("lerp", |v, _| v[0].lerp(&v[1], &v[2]), lerp),
+    ]
+}
+
+/// Operations with constants of any bits.
+fn with_constants<T: Scalar>() -> Vec<Operation<T>> {
+    fn row<T: Scalar>(
+        name: &'static str,
+        operands: usize,
+        function: Function<T>,
+        reference: fn(&[f64], [f64; 2]) -> Reference,
+        constants: fn([f64; 2]) -> [f64; 2],
+    ) -> Operation<T> {
+        Operation { name, operands, function, domain: |x| x, reference, constants: Some(constants) }
+    }
+    let positive = |c: [f64; 2]| c.map(|c| if c == 0.0 { 1.0 } else { c.abs() });
+    let exponent = |[n, _]: [f64; 2]| [(if n.abs() < 2.0_f64.powi(31) { n } else { n % 1000.0 }).trunc(), 0.0];
+    vec![
+        row("powf, any", 1, |v, [p, _]| v[0].powf(p), |x, [p, _]| constant_power(x[0], p), |c| c),
+        row("powi, any", 1, |v, [n, _]| v[0].powi(n as i32), |x, [n, _]| constant_power(x[0], n), exponent),
+        row("elu, any", 1, |v, [alpha, _]| v[0].elu(alpha), |x, [alpha, _]| elu(x[0], alpha), positive),
+        row(
+            "leaky_relu, any",
+            1,
+            |v, [slope, _]| v[0].leaky_relu(slope),
+            |x, [slope, _]| {
+                let slope = Exact::new(if x[0] > 0.0 { 1.0 } else { slope });
+                of(Exact::new(x[0]) * slope, [slope])
+            },
+            positive,
+        ),
+        row(
+            "affine, any",
+            1,
+            |v, [scale, shift]| v[0].affine(scale, shift),
+            |x, [scale, shift]| {
+                let scale = Exact::new(scale);
+                with_terms(sum(Exact::new(x[0]) * scale, Exact::new(shift)), [(scale, scale)])
+            },
+            |c| c,
+        ),
+        row(
+            "clamp, any",
+            1,
+            |v, [low, high]| v[0].clamp(low, high),
+            |x, [low, high]| {
+                let slope = if (low..=high).contains(&x[0]) { 1.0 } else { 0.0 };
+                of(Exact::new(x[0].clamp(low, high)), [Exact::new(slope)])
+            },
+            |[a, b]| [a.min(b), a.max(b)],
+        ),
+        row("huber, any", 2, |v, [c, _]| v[0].huber(&v[1], c), |x, [c, _]| huber(x[0], x[1], c), positive),
+        row("smooth_l1, any", 2, |v, [c, _]| v[0].smooth_l1(&v[1], c), |x, [c, _]| smooth_l1(x[0], x[1], c), positive),
+    ]
 }
 
 fn losses<T: Scalar>() -> Vec<Operation<T>> {
@@ -342,7 +422,7 @@ fn losses<T: Scalar>() -> Vec<Operation<T>> {
         "smooth_l1, 1.5": |v| v[0].smooth_l1(&v[1], 1.5), |a, b| smooth_l1(a, b, 1.5);
         "smooth_l1, 2^100": |v| v[0].smooth_l1(&v[1], 2.0_f64.powi(100)), |a, b| smooth_l1(a, b, 2.0_f64.powi(100));
         "smooth_l1, 2^-100": |v| v[0].smooth_l1(&v[1], 2.0_f64.powi(-100)), |a, b| smooth_l1(a, b, 2.0_f64.powi(-100));
-        "bce_with_logits": |v| v[0].binary_cross_entropy_with_logits(&v[1]), |a, b| {
+        "binary_cross_entropy_with_logits": |v| v[0].binary_cross_entropy_with_logits(&v[1]), |a, b| {
             let [logit, target] = pair([a, b]);
             let tail = (-logit.abs()).softplus();
             let other = logit.abs() * if a > 0.0 { one() - target } else { target };
@@ -359,6 +439,11 @@ fn losses<T: Scalar>() -> Vec<Operation<T>> {
         };
     }
     rows
+}
+
+fn elu(x: f64, alpha: f64) -> Reference {
+    let (alpha, below) = (Exact::new(alpha), Exact::new(x));
+    if x > 0.0 { of(below, [one()]) } else { of(alpha * below.expm1(), [alpha * below.exp()]) }
 }
 
 fn huber(a: f64, b: f64, delta: f64) -> Reference {

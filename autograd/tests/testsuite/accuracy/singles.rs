@@ -1,0 +1,126 @@
+//! Errors of operations in f32 against the same operations in f64, which are measured against the reference themselves.
+//! An error close to the limit is measured again, against the reference.
+//!
+//! In the suite these are some thousand cases an operation. All 2^32 arguments of the functions of one operand, with random
+//! incoming gradients, take about an hour on two cores:
+//!
+//! ```sh
+//! ACCURACY_SINGLES=4294967296 cargo test --release -p raygrad-autograd --test testsuite singles -- --nocapture
+//! ```
+//!
+//! Operations of more operands have as many random cases.
+
+use super::operations::{Operation, operations};
+use super::{Column, Format, Random, compared, constants, evaluate, gate, is_asked, place, report, setting};
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Cases that are evaluated together.
+const BATCH: usize = 1 << 12;
+
+/// The error of `got` in units in the last place of f32, from a result of f64.
+fn quick_error(got: f64, exact: f64) -> f64 {
+    const LIMIT: f64 = 2.0 * (1_u128 << 127) as f64;
+    if exact.is_nan() || got.is_nan() {
+        return if exact.is_nan() && got.is_nan() { 0.0 } else { f64::INFINITY };
+    }
+    if exact.abs() >= LIMIT && got.is_infinite() {
+        return if exact.signum() == got.signum() { 0.0 } else { f64::INFINITY };
+    }
+    // Infinity stands for the number after the largest.
+    let got = if got.is_infinite() { LIMIT.copysign(got) } else { got };
+    let exponent = ((exact.to_bits() >> 52 & 0x7ff) as i64 - 1023).max(-126);
+    (got - exact).abs() * f64::from_bits(((1023 + 23 - exponent) as u64) << 52)
+}
+
+/// The exponent of a normal number.
+fn exponent(x: f64) -> Option<i64> {
+    let bits = x.to_bits() >> 52 & 0x7ff;
+    (1..0x7ff).contains(&bits).then_some(bits as i64 - 1023)
+}
+
+/// The errors of the cases with these numbers, which have the same constants.
+fn examine(single: &Operation<f32>, double: &Operation<f64>, cases: Range<u64>, step: u64) -> Vec<Column> {
+    let (n, operands) = ((cases.end - cases.start) as usize, single.operands);
+    let constants = constants(single, cases.start as usize);
+    let mut random = Random::of(single.name, cases.start);
+    let mut x = vec![Vec::with_capacity(n); operands];
+    for case in cases {
+        if operands == 1 {
+            x[0].push(f64::from(f32::from_bits((case * step) as u32)));
+        } else {
+            let drawn = (0..operands).map(|_| random.argument::<f32>()).collect();
+            let drawn = (single.domain)(random.related::<f32>(drawn));
+            x.iter_mut().zip(drawn).for_each(|(x, drawn)| x.push(drawn));
+        }
+    }
+    let slopes = evaluate(double, constants, x.clone(), vec![1.0; n]);
+    let slopes: Vec<&[f64]> = slopes[1..].iter().map(|slopes| slopes.as_slice()).collect();
+    let mut exponents = [None; 3];
+    let g: Vec<f64> = (0..n)
+        .map(|i| {
+            exponents.iter_mut().zip(&slopes).for_each(|(place, slopes)| *place = exponent(slopes[i]));
+            random.gradient::<f32>(&exponents[..operands])
+        })
+        .collect();
+    let narrow = |x: &[f64]| x.iter().map(|&x| x as f32).collect::<Vec<_>>();
+    let results = evaluate(single, constants, x.iter().map(|x| narrow(x)).collect(), narrow(&g));
+    let references = evaluate(double, constants, x.clone(), g.clone());
+    let values = results[0].as_slice();
+    let column = |k: usize| {
+        let (results, references) = (results[k].as_slice(), references[k].as_slice());
+        let (mut column, mut worst, gate) = (Column::default(), None, gate(single.name, k > 0));
+        let x = |i: usize| x.iter().map(|x| x[i]).collect::<Vec<_>>();
+        let mut add = |i: usize| {
+            let exact = compared(&(single.reference)(&x(i), constants), g[i], values[i].into());
+            if let Some((exact, term)) = exact[k] {
+                let error = Format::of::<f32>().error(results[i].into(), exact, term);
+                column.add(error, gate, || place(&x(i), (k > 0).then_some(g[i]), constants));
+            }
+        };
+        let (mut sum, mut count) = (0.0, 0);
+        for (i, (&got, &reference)) in results.iter().zip(references).enumerate() {
+            if k > 0 && !values[i].is_finite() {
+                continue;
+            }
+            let error = quick_error(got.into(), reference);
+            if !(error < 0.99 * gate) {
+                add(i);
+                continue;
+            }
+            (sum, count) = (sum + error, count + 1);
+            if error > worst.map_or(0.0, |(most, _)| most) {
+                worst = Some((error, i));
+            }
+        }
+        // The worst of the others, which may be reported.
+        if let Some((error, i)) = worst {
+            (sum, count) = (sum - error, count - 1);
+            add(i);
+        }
+        Column { sum: column.sum + sum, count: column.count + count, ..column }
+    };
+    (0..=operands).map(column).collect()
+}
+
+#[test]
+fn singles_agree_with_doubles() {
+    let cases = setting("ACCURACY_SINGLES").unwrap_or(1 << 12) as u64;
+    let rows = operations::<f32>().into_iter().zip(operations::<f64>()).filter(|(row, _)| is_asked(row.name));
+    let failed: Vec<String> = rows
+        .flat_map(|(single, double)| {
+            // Every `step`-th bit pattern, of all exponents.
+            let step = ((1 << 32) / cases).max(1) | 1;
+            let size = if single.constants.is_some() { 128 } else { BATCH as u64 };
+            let columns = (0..cases.div_ceil(size))
+                .into_par_iter()
+                .map(|part| examine(&single, &double, part * size..((part + 1) * size).min(cases), step))
+                .reduce(
+                    || vec![Column::default(); 1 + single.operands],
+                    |a, b| a.into_iter().zip(b).map(|(a, b)| a.joined(b)).collect(),
+                );
+            report::<f32>(single.name, columns, cases as usize / 10)
+        })
+        .collect();
+    assert!(failed.is_empty(), "beyond the limit:\n{}", failed.join("\n"));
+}
