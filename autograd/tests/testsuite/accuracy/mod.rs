@@ -2,8 +2,8 @@
 //!
 //! Values and gradients are compared one by one with a reference of 100 bits ([`exact`]). Arguments are drawn from all
 //! bit patterns, close to kinks and borders, and where functions are used; incoming gradients from all bit patterns, and
-//! so that the result is a normal number. `ACCURACY_DRAWS` sets how many, `ACCURACY_SEED` which, and
-//! `ACCURACY_ONLY=gelu,tanh` for which operations. `ACCURACY_DUMP` names a folder for arguments and exact results, which
+//! so that the result is a normal number. `ACCURACY_DRAWS` sets how many and `ACCURACY_SEED` which;
+//! `ACCURACY_ONLY=gelu,tanh` and `ACCURACY_OPERANDS=1` select operations. `ACCURACY_DUMP` names a folder for arguments and exact results, which
 //! `benches/peers/accuracy.py` reads. [`singles`] has many more cases in f32.
 
 mod exact;
@@ -101,10 +101,11 @@ fn setting(name: &str) -> Option<usize> {
     std::env::var(name).ok().map(|text| text.parse().unwrap_or_else(|_| panic!("{name}={text} is not a number")))
 }
 
-/// Whether `ACCURACY_ONLY` asks for the operation.
-fn is_asked(name: &str) -> bool {
+/// Whether `ACCURACY_ONLY` and `ACCURACY_OPERANDS` ask for the operation.
+fn is_asked(name: &str, operands: usize) -> bool {
     let only = std::env::var("ACCURACY_ONLY").unwrap_or_default();
-    only.is_empty() || only.split(',').any(|part| name.starts_with(part))
+    let is_named = only.is_empty() || only.split(',').any(|part| name.starts_with(part));
+    is_named && setting("ACCURACY_OPERANDS").is_none_or(|number| number == operands)
 }
 
 impl Random {
@@ -355,7 +356,7 @@ fn place(x: &[f64], g: Option<f64>, constants: [f64; 2]) -> Vec<f64> {
 
 /// Prints a row for each operation and returns the breaches.
 fn check<T: Scalar>(draws: usize) -> Vec<String> {
-    let asked = operations::<T>().into_iter().filter(|operation| is_asked(operation.name));
+    let asked = operations::<T>().into_iter().filter(|operation| is_asked(operation.name, operation.operands));
     asked.flat_map(|operation| report::<T>(operation.name, examine(&operation, draws), draws / 10)).collect()
 }
 
