@@ -286,6 +286,9 @@ fn of_numbers<'t, T: Scalar, const N: usize>(
 /// The operands are [`Number`](crate::Number)s: they mix with `f64` constants, and functions are methods. List captured
 /// numbers first, in brackets; each is `Into<f64>`.
 ///
+/// Products in the value and in the gradients are ordinary ones: a derivative that underflows is 0, also where a large
+/// incoming gradient would bring it back into range. An implementation of [`Formula`](crate::Formula) can do better.
+///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor, formula};
 /// let tape = Tape::<f32>::new();

@@ -201,10 +201,13 @@ pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
 /// has lost digits.
 #[inline(always)]
 pub(crate) fn length_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
-    let y = unless_zero(y);
-    checked!(s * a / y, [s, a, y], [], {
+    let quick = s * a / unless_zero(y);
+    checked!(quick, [s, a, y], [], {
         let scale = unless_zero(a.abs().maximum(b.abs()));
-        (s.wide() * (a.wide() / scale.wide()) / unit_square(a / scale, b / scale).sqrt().wide()).narrow()
+        let length = unit_square(a / scale, b / scale).sqrt();
+        let full = (s.wide() * (a.wide() / scale.wide()) / length.wide()).narrow();
+        // An infinite vector has no unit vector, but its limits.
+        (a.like(1.0) / scale).if_positive(full, quick)
     })
 }
 

@@ -2,16 +2,28 @@
 
     mkdir cases && ACCURACY_DUMP=$PWD/cases ACCURACY_DRAWS=20000 \
         cargo test --release -p raygrad-autograd --test testsuite accuracy
-    python accuracy.py cases ../../docs/library/accuracy.md
+    cargo build --release -p raygrad-autograd --example op_speed
+    python accuracy.py cases ../../docs --speed ../../target/release/examples/op_speed
 
 The test writes arguments, incoming gradients and exact results. This script evaluates the same operations in PyTorch and
 JAX on the CPU and measures their errors in the same units. Cases in which an argument, the gradient or the exact result
 is a subnormal number are counted apart, since XLA takes such numbers for 0.
+
+With `--speed` it also draws docs/bench/accuracy.png: errors against the time of each function, on one thread in f32.
+PyTorch and JAX are timed in turns with raygrad's program, on 131072 numbers between 0 and 1.
 """
 
+import argparse
+import json
+import os
 import re
-import sys
+import statistics
+import subprocess
+import time
 from pathlib import Path
+
+# One thread, before the libraries start theirs.
+os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 import jax
 import numpy as np
@@ -67,6 +79,10 @@ PEERS = {
     "cosh": (torch.cosh, jnp.cosh),
     "tanh": (torch.tanh, jnp.tanh),
     "abs": (torch.abs, jnp.abs),
+    "sign": (torch.sign, jnp.sign),
+    "floor": (torch.floor, jnp.floor),
+    "ceil": (torch.ceil, jnp.ceil),
+    "round": (torch.round, jnp.round),
     "reciprocal": (torch.reciprocal, jnp.reciprocal),
     "affine": (lambda x: -2.5 * x + 0.75, lambda x: -2.5 * x + 0.75),
     "clamp": (lambda x: x.clamp(-1, 2), lambda x: jnp.clip(x, -1, 2)),
@@ -87,6 +103,8 @@ PEERS = {
     "div": (torch.div, jnp.divide),
     "maximum": (torch.maximum, jnp.maximum),
     "minimum": (torch.minimum, jnp.minimum),
+    "if_positive": (lambda a, b, c: torch.where(a > 0, b, c), lambda a, b, c: jnp.where(a > 0, b, c)),
+    "where": (lambda a, b, c: torch.where(a > 0, b, c), lambda a, b, c: jnp.where(a > 0, b, c)),
     "lerp": (torch.lerp, lambda a, b, w: a + w * (b - a)),
     "atan2": (torch.atan2, jnp.arctan2),
     "hypot": (torch.hypot, jnp.hypot),
@@ -104,9 +122,9 @@ PEERS = {
     "smooth_l1_2^-100": (torch_smooth(SMALL), jax_smooth(SMALL)),
     "binary_cross_entropy_with_logits": (lambda a, b: F.binary_cross_entropy_with_logits(a, b, reduction="none"), jax_bce),
 }
-for n in (3, 4, 5, 12, -1, -2, -7):
+for n in (0, 1, 3, 4, 5, 12, -1, -2, -7):
     PEERS[f"powi_{n}"] = (lambda x, n=n: x**n, lambda x, n=n: x**n)
-for name, p in {"0.5": 0.5, "1.75": 1.75, "2": 2.0, "-0.5": -0.5, "2^-80": 2.0**-80}.items():
+for name, p in {"0": 0.0, "1": 1.0, "0.5": 0.5, "1.75": 1.75, "2": 2.0, "-0.5": -0.5, "2^-80": 2.0**-80}.items():
     PEERS[f"powf_{name}"] = (lambda x, p=p: x**p, lambda x, p=p: x**p)
 
 HEAD = """# Accuracy
@@ -115,7 +133,7 @@ Errors of elementwise operations in units in the last place (ULP), over all bits
 This page is generated; do not edit it by hand. `benches/peers/accuracy.py` has the commands.
 The versions are {versions}.
 
-- Each cell has the worst error, and in brackets the number of errors above 8 ULP. "inf" is an infinite or a NaN result
+- Each cell has the worst error, the mean error, and in brackets the number of errors above 8 ULP. "inf" is an infinite or a NaN result
   that should be finite, or a finite one that should not.
 - Each operation and type has {draws} cases. Three of eight arguments are any bit pattern. The others are of usual size,
   or close to kinks and borders.
@@ -126,7 +144,21 @@ The versions are {versions}.
 - At kinks and ties the libraries have other conventions, which count as errors here.
 - JAX has no binary cross-entropy, Huber and smooth L1 loss: those are written with `jnp.where`.
 - **Bold**: raygrad's worst error is not the smallest. Most of its functions are straight-line code with the same bits
-  on every instruction set ([vector math](vector-math.md)). That costs some tenths of a unit.
+  on every instruction set ([vector math](vector-math.md)). That costs some tenths of a unit. Gradients of the sine and
+  the cosine are their values. The others in bold have products in an order that keeps their range.
+
+Errors above 8 ULP of raygrad: none. The arguments of its worst cases are printed by
+
+```sh
+ACCURACY_DRAWS=20000 cargo test --release -p raygrad-autograd --test testsuite accuracy -- --nocapture
+```
+
+## Time and error
+
+![Time and error](../bench/accuracy.png)
+
+Each point is a function in f32: the time an element on one thread, of numbers in cache between 0 and 1, and the worst
+error of the tables below. The backward pass includes the gradients of all operands.
 
 """
 
@@ -159,7 +191,8 @@ def errors(got, high, low, unit, limit):
 
 def cell(error):
     worst, above = error.max(initial=0), int((~(error <= 8)).sum())
-    text = "inf" if not np.isfinite(worst) else f"{abs(worst):.1f}" if worst < 100 else f"{worst:.0e}"
+    short = lambda x: "inf" if not np.isfinite(x) else f"{abs(x):.1f}" if x < 100 else f"{x:.0e}"
+    text = f"{short(worst)}, {np.mean(error) if len(error) else 0:.2f}" if not above else short(worst)
     return f"{text} ({above})" if above else text
 
 
@@ -175,7 +208,7 @@ def row(name, kind, path):
     results = {"PyTorch": torch_f and torch_results(torch_f, x, g), "JAX": jax_f and jax_results(jax_f, x, g)}
     least = np.finfo(dtype).tiny
     limit = 1.0, 128 if kind == "f32" else 1024
-    lines = []
+    lines, worsts = [], []
     for k in range(operands + 1):
         high, low, unit, own = cases[:, operands + 1 + 4 * k : operands + 5 + 4 * k].T
         unit = unit.astype(int)
@@ -194,23 +227,105 @@ def row(name, kind, path):
         worst = {n: c[compared & ~tiny].max(initial=0) for n, c in columns.items() if c is not None}
         if worst["raygrad"] > min(worst.values()) + 0.05:
             ordinary[0] = f"**{ordinary[0]}**"
+        worsts.append(worst)
         of = "value" if k == 0 else "gradient" if operands == 1 else f"gradient {k}"
         title = re.sub("_(-?[0-9])", r", \1", name)
         counts = ", ".join(r or "-" for r in rest)
         lines.append(f"| `{title}` {of} | {' | '.join(ordinary)} | {counts} |")
-    return lines, len(cases)
+    return lines, len(cases), worsts
+
+
+def fastest(f):
+    """Nanoseconds of the fastest call."""
+    best = float("inf")
+    for _ in range(60):
+        start = time.perf_counter_ns()
+        f()
+        best = min(best, time.perf_counter_ns() - start)
+    return best
+
+
+def torch_times(f, x):
+    x = [torch.tensor(x, requires_grad=True) for x in x]
+    y = f(*x)
+    g = torch.ones_like(y)
+    forward = fastest(lambda: f(*x))
+    return [forward, fastest(lambda: torch.autograd.grad(y, x, g, retain_graph=True))]
+
+
+def jax_times(f, x):
+    x = [jnp.asarray(x) for x in x]
+    forward, both = jax.jit(f), jax.jit(lambda *x: jax.vjp(f, *x)[1](jnp.ones_like(x[0])))
+    forward(*x).block_until_ready(), jax.block_until_ready(both(*x))
+    # Compiled as one, the backward pass computes what it needs of the forward pass.
+    return [fastest(lambda: forward(*x).block_until_ready()), fastest(lambda: jax.block_until_ready(both(*x)))]
+
+
+def times(program):
+    """Of each function and library: nanoseconds an element, forward and backward; medians of three turns."""
+    torch.set_num_threads(1)
+    n, rng, turns = 1 << 17, np.random.default_rng(0), {}
+    for _ in range(3):
+        output = subprocess.run([program, "functions"], check=True, capture_output=True, text=True).stdout
+        for line in map(json.loads, output.splitlines()):
+            name = line["function"].replace(", ", "_")
+            x = [rng.uniform(0.02, 0.98, n).astype(np.float32) for _ in range(2)]
+            of = turns.setdefault(name, {"raygrad": []})
+            of["raygrad"].append([line["forward"], line["backward"]])
+            for library, f, measure in zip(("PyTorch", "JAX"), PEERS[name], (torch_times, jax_times)):
+                if f is not None:
+                    try:
+                        took = measure(f, x)
+                    except TypeError:
+                        took = measure(f, x[:1])
+                    of.setdefault(library, []).append([t / n for t in took])
+    median = lambda rows: [statistics.median(column) for column in zip(*rows)]
+    return {name: {library: median(rows) for library, rows in of.items()} for name, of in turns.items()}
+
+
+def plot(figures, worsts, path):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    most, looks = 1e8, {"raygrad": ("o", "tab:blue"), "PyTorch": ("^", "tab:orange"), "JAX": ("s", "tab:green")}
+    figure, panels = pyplot.subplots(1, 2, figsize=(11, 4.6), sharey=True, constrained_layout=True)
+    for k, (panel, title) in enumerate(zip(panels, ("value", "gradient"))):
+        for library, (marker, colour) in looks.items():
+            at = []
+            for name, of in figures.items():
+                if library in of:
+                    errors = worsts[name][:1] if k == 0 else worsts[name][1:]
+                    error = max(error.get(library, 0) for error in errors)
+                    at.append((of[library][k], min(max(error, 0.1), most)))
+            panel.scatter(*zip(*at), marker=marker, color=colour, label=library, alpha=0.75, s=28)
+        panel.axhline(8, color="grey", linewidth=0.8, linestyle="--")
+        panel.set(xscale="log", yscale="log", title=title, xlabel="nanoseconds an element")
+        panel.grid(alpha=0.25)
+    panels[0].set_ylabel("worst error, ULP (infinite: 1e8)")
+    panels[1].legend(loc="center right")
+    figure.savefig(path, dpi=100)
 
 
 def main():
-    folder, out = Path(sys.argv[1]), Path(sys.argv[2])
-    text, draws = "", 0
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("cases", type=Path, help="the folder that the test has written")
+    parser.add_argument("docs", type=Path, help="the folder of the documents")
+    parser.add_argument("--speed", help="the example op_speed; draws the plot")
+    args = parser.parse_args()
+    folder, out = args.cases, args.docs / "library/accuracy.md"
+    text, draws, worsts = "", 0, {}
     for kind in ("f32", "f64"):
         text += f"## {kind}\n\n| operation | raygrad | PyTorch | JAX | subnormal |\n|---|--:|--:|--:|---|\n"
         for name in PEERS:
-            lines, draws = row(name, kind, folder / f"{name}.{kind}")
+            lines, draws, worst = row(name, kind, folder / f"{name}.{kind}")
+            worsts.setdefault(name, worst)
             text += "\n".join(lines) + "\n"
         text += "\n"
     versions = f"PyTorch {torch.__version__.split('+')[0]}, JAX {jax.__version__}"
+    if args.speed:
+        plot(times(args.speed), worsts, args.docs / "bench/accuracy.png")
     out.write_text(HEAD.format(versions=versions, draws=draws) + text.rstrip() + "\n")
 
 
