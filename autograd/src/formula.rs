@@ -132,11 +132,13 @@ impl<F: Formula<N>, const N: usize> Elementwise<F, N> {
 
     #[inline(always)]
     fn gradients_in<T: Scalar, const MODE: u8>(&self, x: &[&[T]], out: &mut [&mut [T]]) -> bool {
+        // A copy, whose constants no store of a result can change.
+        let formula = self.0;
         lanes_fused::<T, MODE, 2, N, N>(
             x,
             out,
             #[inline(always)]
-            |[g, y], x| self.0.vjp(g, x, y),
+            move |[g, y], x| formula.vjp(g, x, y),
         )
     }
 
@@ -151,11 +153,12 @@ impl<F: Formula<N>, const N: usize> Elementwise<F, N> {
 
     #[inline(always)]
     fn values_in<T: Scalar, const MODE: u8>(&self, x: &[&[T]], out: &mut [&mut [T]]) -> bool {
+        let formula = self.0;
         lanes_fused::<T, MODE, 0, N, 1>(
             x,
             out,
             #[inline(always)]
-            |[], x| [self.0.f(x)],
+            move |[], x| [formula.f(x)],
         )
     }
 }

@@ -89,6 +89,7 @@ impl Real for Reading {
     #[inline(always)]
     fn checked<const K: usize, const M: usize>(
         quick: Self,
+        _s: Self,
         _inputs: [Self; K],
         _factors: [Self; M],
         exact: impl FnOnce() -> Self,

@@ -1,17 +1,18 @@
 //! Derivatives of the elementary functions: each takes the slope `s` of the argument and returns that of the result.
 //!
 //! A slope is an incoming gradient times a derivative. It may be an ordinary number where the derivative alone, or a
-//! product on the way to it, is out of range: so such products are [`Wide`]. Products and quotients have the same order as
-//! the quick ones, and so the same bits: a power of two as a factor of the operands is one of the result.
+//! product on the way to it, is out of range: so such products are [`Wide`]. Products and quotients of operands alone have
+//! the same order as the quick ones, and so the same bits: a power of two as a factor of the operands is one of the result.
 
 use raygrad_tensor::{Real, Wide};
 use std::f64::consts::{LN_2, PI};
 
 /// [`Real::checked`] with an expression in place of the closure. Only inlined closures are vectorised.
 macro_rules! checked {
-    ($quick:expr, $inputs:expr, $factors:expr, $exact:expr) => {
+    ($quick:expr, $s:expr, $inputs:expr, $factors:expr, $exact:expr) => {
         raygrad_tensor::Real::checked(
             $quick,
+            $s,
             $inputs,
             $factors,
             #[inline(always)]
@@ -38,7 +39,7 @@ pub(crate) fn at_most<E: Real>(x: E, high: f64) -> E {
 /// `s e^x`, for y = e^x.
 #[inline(always)]
 pub(crate) fn exp_slope<E: Real>(s: E, x: E, y: E) -> E {
-    checked!(s * y, [], [y], (s.wide() * E::Wide::exp(x, x.like(0.0))).narrow())
+    checked!(s * y, s, [], [y], (s.wide() * E::Wide::exp(x, x.like(0.0))).narrow())
 }
 
 /// `s e^(c x^2)`, for a power of two `c`. The rounding error of the square counts as many times as the square is large.
@@ -46,7 +47,7 @@ pub(crate) fn exp_slope<E: Real>(s: E, x: E, y: E) -> E {
 pub(crate) fn bell<E: Real>(s: E, x: E, c: f64) -> E {
     let [square, low] = scaled_square(x, c);
     let y = square.exp();
-    checked!(s * y.mul_add(low, y), [], [y], (s.wide() * wide_bell(x, c)).narrow())
+    checked!(s * y.mul_add(low, y), s, [], [y], (s.wide() * wide_bell(x, c)).narrow())
 }
 
 /// `e^(c x^2)`, for a power of two `c`.
@@ -66,15 +67,15 @@ fn scaled_square<E: Real>(x: E, c: f64) -> [E; 2] {
     [square, (one - low.abs()).if_positive(low, x.like(0.0))]
 }
 
-/// `s 2^x ln 2`, for y = 2^x; from twice the rounded half of x and the rest.
+/// `s 2^x ln 2`, for y = 2^x; from four times the rounded quarter of x and the rest.
 #[inline(always)]
 pub(crate) fn exp2_slope<E: Real>(s: E, x: E, y: E) -> E {
     let ln_2 = x.like(LN_2);
-    checked!(s * (y * ln_2), [], [y], {
+    checked!(s * (y * ln_2), s, [], [y], {
         let x = at_most(at_least(x, -4e3), 4e3);
-        let half = (x.like(0.5) * x).round();
-        let (root, rest) = (half.exp2().wide(), (x - half - half).exp2().wide());
-        (s.wide() * ln_2.wide() * root * root * rest).narrow()
+        let quarter = (x.like(0.25) * x).round();
+        let (root, rest) = (quarter.exp2().wide(), (x - x.like(4.0) * quarter).exp2().wide());
+        (s.wide() * ln_2.wide() * (root * root) * (root * root) * rest).narrow()
     })
 }
 
@@ -88,7 +89,7 @@ pub(crate) fn wide_sigmoid<E: Real>(x: E) -> E::Wide {
 #[inline(always)]
 pub(crate) fn corrected_sigmoid<E: Real>(s: E, x: E, low: E) -> E {
     let share = near_sigmoid(x, low);
-    checked!(s * share, [], [share], (s.wide() * E::Wide::sigmoid(x, low)).narrow())
+    checked!(s * share, s, [], [share], (s.wide() * E::Wide::sigmoid(x, low)).narrow())
 }
 
 /// `1 / (1 + e^-(x + low))` for a rounding error `low` of x.
@@ -111,36 +112,42 @@ fn logistic_density<E: Real>(x: E) -> E {
 #[inline(always)]
 pub(crate) fn sigmoid_slope<E: Real>(s: E, x: E) -> E {
     let slope = logistic_density(x);
-    checked!(s * slope, [], [slope], (s.wide() * wide_sigmoid(x) * wide_sigmoid(-x)).narrow())
+    checked!(s * slope, s, [], [slope], (s.wide() * wide_sigmoid(x) * wide_sigmoid(-x)).narrow())
 }
 
 /// The derivative of softplus is the sigmoid.
 #[inline(always)]
 pub(crate) fn softplus_slope<E: Real>(s: E, x: E) -> E {
     let slope = x.sigmoid();
-    checked!(s * slope, [], [slope], (s.wide() * wide_sigmoid(x)).narrow())
+    checked!(s * slope, s, [], [slope], (s.wide() * wide_sigmoid(x)).narrow())
 }
 
 /// `1 - tanh^2 x` is four times the derivative of the sigmoid at 2x.
 #[inline(always)]
 pub(crate) fn tanh_slope<E: Real>(s: E, x: E) -> E {
     let (twice, four) = (x + x, x.like(4.0));
-    let slope = four * logistic_density(twice);
-    checked!(s * slope, [], [slope], (s.wide() * four.wide() * wide_sigmoid(twice) * wide_sigmoid(-twice)).narrow())
+    let density = logistic_density(twice);
+    checked!(
+        s * (four * density),
+        s * four,
+        [],
+        [density],
+        (s.wide() * four.wide() * wide_sigmoid(twice) * wide_sigmoid(-twice)).narrow()
+    )
 }
 
 /// `s cosh x`, as `s e^x / 2 + s e^-x / 2`.
 #[inline(always)]
 pub(crate) fn sinh_slope<E: Real>(s: E, x: E) -> E {
     let slope = x.cosh();
-    checked!(s * slope, [], [slope], half_exp(s, x) + half_exp(s, -x))
+    checked!(s * slope, s, [], [slope], half_exp(s, x) + half_exp(s, -x))
 }
 
 /// `s sinh x`, as a difference where it does not cancel.
 #[inline(always)]
 pub(crate) fn cosh_slope<E: Real>(s: E, x: E) -> E {
     let slope = x.sinh();
-    checked!(s * slope, [slope], [], {
+    checked!(s * slope, s, [], [slope], {
         let is_near = x.like(1.0) - x.abs();
         is_near.if_positive(s * slope, half_exp(s, x) - half_exp(s, -x))
     })
@@ -155,7 +162,7 @@ fn half_exp<E: Real>(s: E, x: E) -> E {
 #[inline(always)]
 pub(crate) fn cos_pi_slope<E: Real>(s: E, x: E) -> E {
     let (one, pi, sine) = (x.like(1.0), x.like(PI), x.sin_pi());
-    checked!(-(s * (pi * sine)), [x], [], {
+    checked!(-(s * (pi * sine)), s, [x], [], {
         let is_far = x.abs() - x.like(1e-9);
         let (sine, factor) = (is_far.if_positive(sine, x), is_far.if_positive(one, pi));
         -(s.wide() * pi.wide() * factor.wide() * sine.wide()).narrow()
@@ -184,17 +191,21 @@ pub(crate) fn atan_slope<E: Real>(s: E, x: E) -> E {
     s / far / is_far.if_positive(far, one + near * near)
 }
 
-/// `s c / (a^2 + b^2)` for c = a or b; 0 at the origin.
+/// `s c / (a^2 + b^2)` for c = a or b; 0 at the origin and at infinity.
 #[inline(always)]
 pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
-    let scale = unless_zero(a.abs().maximum(b.abs()));
+    let largest = a.abs().maximum(b.abs());
+    let scale = unless_zero(largest);
     let square = unit_square(a / scale, b / scale);
-    checked!(
+    let full = checked!(
         s / scale / square * (c / scale),
-        [s, c, scale],
+        s,
+        [s, c, largest],
         [],
         (s.wide() / scale.wide() / square.wide() * (c.wide() / scale.wide())).narrow()
-    )
+    );
+    // The limit is 0 for an infinite vector.
+    (a.like(1.0) / scale).if_positive(full, s / scale)
 }
 
 /// The derivative `a / y` of the length y of the vector (a, b) by a; 0 at the origin. A length that is a subnormal number
@@ -202,11 +213,11 @@ pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
 #[inline(always)]
 pub(crate) fn length_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let quick = s * a / unless_zero(y);
-    checked!(quick, [s, a, y], [], {
+    checked!(quick, s, [s, a, y], [], {
         let scale = unless_zero(a.abs().maximum(b.abs()));
         let length = unit_square(a / scale, b / scale).sqrt();
         let full = (s.wide() * (a.wide() / scale.wide()) / length.wide()).narrow();
-        // An infinite vector has no unit vector, but its limits.
+        // An infinite vector has no unit vector.
         (a.like(1.0) / scale).if_positive(full, quick)
     })
 }
@@ -227,19 +238,19 @@ fn unless_zero<E: Real>(x: E) -> E {
 /// `s a / b`.
 #[inline(always)]
 pub(crate) fn product_over<E: Real>(s: E, a: E, b: E) -> E {
-    checked!(s * a / b, [s, a, b], [], (s.wide() * a.wide() / b.wide()).narrow())
+    checked!(s * a / b, s, [s, a, b], [], (s.wide() * a.wide() / b.wide()).narrow())
 }
 
 /// `s a / b^2`.
 #[inline(always)]
 pub(crate) fn over_square<E: Real>(s: E, a: E, b: E) -> E {
-    checked!(s / b * (a / b), [s, a, b], [], (s.wide() / b.wide() * (a.wide() / b.wide())).narrow())
+    checked!(s / b * (a / b), s, [s, a, b], [], (s.wide() / b.wide() * (a.wide() / b.wide())).narrow())
 }
 
 /// `s floor(a / b)`, from the remainder y.
 #[inline(always)]
 pub(crate) fn multiple<E: Real>(s: E, a: E, b: E, y: E) -> E {
-    checked!(s * ((a - y) / b).round(), [s, a, b], [], {
+    checked!(s * ((a - y) / b).round(), s, [s, a, b], [], {
         let [difference, scale] = scaled_difference(a, y);
         let quotient = difference.wide() / (b.wide() * scale.wide());
         // A rounded quotient is constant also for further derivatives; a large one is too large for rounding.
@@ -264,14 +275,15 @@ pub(crate) fn powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
     match n {
         1 => s,
         2 => s * x * factor,
-        3 => checked!(s * x * x * factor, [s, x], [], (s.wide() * x.wide() * x.wide() * factor.wide()).narrow()),
+        3 => checked!(s * x * x * factor, s, [s, x], [], (s.wide() * x.wide() * x.wide() * factor.wide()).narrow()),
         4 => checked!(
             s * x * x * x * factor,
+            s,
             [s, x],
             [],
             (s.wide() * x.wide() * x.wide() * x.wide() * factor.wide()).narrow()
         ),
-        -1 => -checked!(s / x / x, [s, x], [], (s.wide() / x.wide() / x.wide()).narrow()),
+        -1 => -checked!(s / x / x, s, [s, x], [], (s.wide() / x.wide() / x.wide()).narrow()),
         _ => any_powi_slope(s, x, n),
     }
 }
@@ -279,13 +291,20 @@ pub(crate) fn powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
 /// [`powi_slope`] in one form for all exponents.
 #[inline(always)]
 pub(crate) fn any_powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
-    let (factor, power) = (x.like(f64::from(n)), x.powi(n.saturating_sub(1)));
+    let (one, factor) = (x.like(1.0), x.like(f64::from(n)));
+    if n == i32::MIN {
+        return base_slope(s, x, factor, x.powi(n));
+    }
+    let power = x.powi(n - 1);
     // At 0 the quick product is right.
+    let is_other = x.abs();
+    let factors = [is_other.if_positive(power, one), is_other.if_positive(factor * power, one)];
     checked!(
         s * (factor * power),
+        s * factor,
         [],
-        [x.abs().if_positive(power, x.like(1.0))],
-        (s.wide() * factor.wide() * E::Wide::powi(x, n.saturating_sub(1))).narrow()
+        factors,
+        (s.wide() * factor.wide() * E::Wide::powi(x, n - 1)).narrow()
     )
 }
 
@@ -301,8 +320,10 @@ pub(crate) fn base_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let is_exact = (b - one) * (b.like(1e6) - b);
     let power = is_exact.if_positive(less, y / base);
     // A zero base has its limit, and a subnormal y has lost digits.
-    let factors = [is_ordinary.if_positive(power, one), is_exact.if_positive(one, is_ordinary.if_positive(y, one))];
-    let full = checked!(s * (b * power), [b], factors, {
+    let of_ordinary = |x: E| is_ordinary.if_positive(x, one);
+    let factors = [of_ordinary(power), of_ordinary(b * power), is_exact.if_positive(one, of_ordinary(y))];
+    // Several factors may bring a number back into range that was lost, whatever s is.
+    let full = checked!(s * (b * power), one + one, [], factors, {
         let y = is_ordinary.if_positive(y, one);
         (s.wide() * b.wide() * E::Wide::pow(base, b, y) / base.wide()).narrow()
     });
@@ -317,8 +338,8 @@ pub(crate) fn exponent_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let (zero, one, size) = (a.like(0.0), a.like(1.0), a.abs());
     // A logarithm that is finite where it is not chosen, or the next derivative would be NaN.
     let ln = size.if_positive(a, one).ln();
-    let full =
-        checked!(s * (y * ln), [], [size.if_positive(y, one)], (s.wide() * E::Wide::pow(a, b, y) * ln.wide()).narrow());
+    let factors = [size.if_positive(y, one), size.if_positive(y * ln, one)];
+    let full = checked!(s * (y * ln), one + one, [], factors, (s.wide() * E::Wide::pow(a, b, y) * ln.wide()).narrow());
     let at_zero = s * (-b).if_positive(y * size.ln(), y * zero + a * zero);
     size.if_positive(full, at_zero)
 }

@@ -1,6 +1,6 @@
 //! The numbers of a vectorised loop over a formula, with the short reduction of sine and cosine where it is valid.
 
-use crate::real::any_extreme;
+use crate::real::any_flag;
 use crate::{Real, Scalar, Wide};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
@@ -21,7 +21,8 @@ pub const EXACT: u8 = 2;
 #[derive(Debug, Clone, Copy)]
 pub struct Lane<T: Scalar, const MODE: u8> {
     value: T,
-    /// Whether an argument on the way to `value` was too large; see [`Scalar::outside`].
+    /// Whether an argument on the way to `value` was too large ([`Scalar::outside`]), or a product may have left the range
+    /// ([`Real::checked`]).
     outside: T::Flags,
 }
 
@@ -142,6 +143,7 @@ impl<T: Scalar, const MODE: u8> Real for Lane<T, MODE> {
     #[inline(always)]
     fn checked<const K: usize, const M: usize>(
         quick: Self,
+        s: Self,
         inputs: [Self; K],
         factors: [Self; M],
         exact: impl FnOnce() -> Self,
@@ -159,7 +161,7 @@ impl<T: Scalar, const MODE: u8> Real for Lane<T, MODE> {
             made[k] = factors[k].value;
             k += 1;
         }
-        let flags = any_extreme(given, made);
+        let flags = any_flag(s.value, given, made);
         if MODE == QUICK {
             return Lane { value: quick.value, outside: quick.outside | flags };
         }

@@ -83,12 +83,17 @@ pub trait Real:
     /// `self * factor + summand`, rounded once on floats.
     fn mul_add(self, factor: Self, summand: Self) -> Self;
 
-    /// `quick`, or `exact` where `quick` may have left the range of the type on the way: where one of the `inputs` is
-    /// neither 0 nor within 2^-63 and 2^63 (2^-511 and 2^511 for f64), or one of the `factors` is not within. The
-    /// default, of dual numbers and of those that stand for variables, is `quick`.
+    /// `quick`, or `exact` where `quick` may have left the range of the type on the way:
+    ///
+    /// * where one of the `inputs` is not 0, infinite or within 2^-63 and 2^63 (2^-511 and 2^511 for f64);
+    /// * where one of the `factors`, rounded results of which `quick` is a product with `s`, is infinite, or below the
+    ///   normal numbers while |s| > 1.
+    ///
+    /// The default, of dual numbers and of those that stand for variables, is `quick`.
     #[inline(always)]
     fn checked<const K: usize, const M: usize>(
         quick: Self,
+        _s: Self,
         _inputs: [Self; K],
         _factors: [Self; M],
         _exact: impl FnOnce() -> Self,
@@ -185,7 +190,7 @@ impl<E: Real> Wide<E> for Plain<E> {
 
 /// The flags of [`Real::checked`].
 #[inline(always)]
-pub(crate) fn any_extreme<T: Scalar, const K: usize, const M: usize>(inputs: [T; K], factors: [T; M]) -> T::Flags {
+pub(crate) fn any_flag<T: Scalar, const K: usize, const M: usize>(s: T, inputs: [T; K], factors: [T; M]) -> T::Flags {
     let (mut flags, mut k) = (T::Flags::default(), 0);
     while k < K {
         flags = flags | inputs[k].is_extreme();
@@ -193,7 +198,7 @@ pub(crate) fn any_extreme<T: Scalar, const K: usize, const M: usize>(inputs: [T;
     }
     k = 0;
     while k < M {
-        flags = flags | factors[k].is_extreme_or_zero();
+        flags = flags | factors[k].is_lost(s);
         k += 1;
     }
     flags
@@ -246,11 +251,12 @@ macro_rules! real {
             #[inline(always)]
             fn checked<const K: usize, const M: usize>(
                 quick: Self,
+                s: Self,
                 inputs: [Self; K],
                 factors: [Self; M],
                 exact: impl FnOnce() -> Self,
             ) -> Self {
-                if $t::is_set(any_extreme(inputs, factors)) { exact() } else { quick }
+                if $t::is_set(any_flag(s, inputs, factors)) { exact() } else { quick }
             }
             type Wide = vmath::wide::$t::Wide;
         }

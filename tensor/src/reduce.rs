@@ -243,7 +243,7 @@ pub fn mean_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -> Ten
     };
     let count = x.len() as f64 / shape.iter().product::<usize>() as f64;
     let mean = mean_of(x, T::from_f64(count));
-    if mean.is_finite() || count.is_nan() || !x.is_finite() {
+    if mean.is_finite() || count.is_nan() {
         return mean;
     }
     // Half the reciprocal of the count, rounded down to a power of two: exact, and no sum of such products overflows.
@@ -254,7 +254,14 @@ pub fn mean_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -> Ten
         #[inline(always)]
         |[x]| x * down,
     );
-    mean_of(&small, T::from_f64(count) * down)
+    let small = mean_of(&small, T::from_f64(count) * down);
+    // Other means have their digits, which small elements lose.
+    map(
+        [&mean, &small],
+        pool,
+        #[inline(always)]
+        |[mean, small]| if mean.is_finite() { mean } else { small },
+    )
 }
 
 /// The sum over the axes whose extent is 1 in `kept`.

@@ -58,12 +58,12 @@ pub trait Scalar:
     /// Flagged if `sin_quick` and `cos_quick` are not valid for this number. NaN is flagged, infinities are too.
     #[doc(hidden)]
     fn outside(self) -> Self::Flags;
-    /// Flagged if the exponent is not in the middle half of its range. Zero is not flagged, NaN is.
+    /// Flagged if the exponent is not in the middle half of its range. Zero and infinity are not flagged.
     #[doc(hidden)]
     fn is_extreme(self) -> Self::Flags;
-    /// Flagged if 0, or [`is_extreme`](Self::is_extreme).
+    /// Flagged if infinite or NaN; or below the normal numbers, and `other` is above 1.
     #[doc(hidden)]
-    fn is_extreme_or_zero(self) -> Self::Flags;
+    fn is_lost(self, other: Self) -> Self::Flags;
     /// Whether the flag is set.
     #[doc(hidden)]
     fn is_set(flags: Self::Flags) -> bool;
@@ -128,15 +128,17 @@ macro_rules! scalar {
             }
             #[inline(always)]
             fn is_extreme(self) -> $bits {
-                // The highest bit of minus a positive number is set.
-                self.is_extreme_or_zero() & self.abs().to_bits().wrapping_neg()
-            }
-            #[inline(always)]
-            fn is_extreme_or_zero(self) -> $bits {
                 // A difference has its highest bit set where it is below zero.
                 let (least, bits) = ($least.to_bits(), self.abs().to_bits());
                 let greatest = $t::to_bits(1.0 / $least);
-                bits.wrapping_sub(least) | greatest.wrapping_sub(bits)
+                let is_small = bits.wrapping_sub(least) & bits.wrapping_neg();
+                is_small | greatest.wrapping_sub(bits) & bits.wrapping_sub($t::INFINITY.to_bits())
+            }
+            #[inline(always)]
+            fn is_lost(self, other: Self) -> $bits {
+                let (bits, other) = (self.abs().to_bits(), other.abs().to_bits());
+                let is_small = bits.wrapping_sub($t::MIN_POSITIVE.to_bits()) & $t::to_bits(1.0).wrapping_sub(other);
+                is_small | $t::MAX.to_bits().wrapping_sub(bits)
             }
             #[inline(always)]
             fn is_set(flags: $bits) -> bool {

@@ -87,8 +87,7 @@ impl Formula<1> for LeakyRelu {
     const NAME: &'static str = "leaky_relu";
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
-        let scaled = x.like(self.slope) * x;
-        x.if_positive(x, scaled)
+        x * x.if_positive(x.like(1.0), x.like(self.slope))
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
@@ -118,7 +117,13 @@ impl Formula<1> for Elu {
         let zero = x.like(0.0);
         let (below, alpha) = (x.if_positive(zero, x), x.if_positive(x.like(1.0), x.like(self.alpha)));
         let y = below.exp();
-        [checked!(g * (y * alpha), [], [y, alpha], (g.wide() * E::Wide::exp(below, zero) * alpha.wide()).narrow())]
+        [checked!(
+            g * (y * alpha),
+            g.like(2.0),
+            [],
+            [y, y * alpha],
+            (g.wide() * E::Wide::exp(below, zero) * alpha.wide()).narrow()
+        )]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
@@ -142,14 +147,14 @@ impl Formula<1> for Gelu {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let x = at_least(x, -FAR);
         let share = x.normal_cdf();
-        checked!(x * share, [x], [share], (x.wide() * E::Wide::normal_cdf(x)).narrow())
+        checked!(x * share, x, [], [share], (x.wide() * E::Wide::normal_cdf(x)).narrow())
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
         let x = at_most(at_least(x, -FAR), FAR);
         let peak = x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2);
         let (share, density) = (x.normal_cdf(), peak * bell(x, x, -0.5));
-        [checked!(g * (share + density), [], [share], {
+        [checked!(g * (share + density), g, [], [share], {
             let share = (g.wide() * E::Wide::normal_cdf(x)).narrow();
             share + (g.wide() * (peak * x).wide() * wide_bell(x, -0.5)).narrow()
         })]
@@ -175,7 +180,7 @@ impl Formula<1> for GeluTanh {
         let x = at_least(x, -FAR);
         let [u, low] = gelu_argument(at_most(x, FAR));
         let share = near_sigmoid(u, low);
-        checked!(x * share, [x], [share], (x.wide() * E::Wide::sigmoid(u, low)).narrow())
+        checked!(x * share, x, [], [share], (x.wide() * E::Wide::sigmoid(u, low)).narrow())
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
@@ -184,7 +189,7 @@ impl Formula<1> for GeluTanh {
         let share = near_sigmoid(u, low);
         let slope = x * (x.like(GELU_SCALE) + x.like(3.0 * GELU_SCALE * GELU_CUBIC) * (x * x));
         let density = share * near_sigmoid(-u, -low);
-        [checked!(g * (share + density * slope), [], [share], {
+        [checked!(g * (share + density * slope), g * slope, [], [share], {
             let share = g.wide() * E::Wide::sigmoid(u, low);
             share.narrow() + (share * E::Wide::sigmoid(-u, -low) * slope.wide()).narrow()
         })]
@@ -206,14 +211,14 @@ impl Formula<1> for Silu {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let x = at_least(x, -FAR);
         let share = x.sigmoid();
-        checked!(x * share, [x], [share], (x.wide() * wide_sigmoid(x)).narrow())
+        checked!(x * share, x, [], [share], (x.wide() * wide_sigmoid(x)).narrow())
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
         let x = at_most(at_least(x, -FAR), FAR);
         let share = x.sigmoid();
         let density = share * (-x).sigmoid();
-        [checked!(g * (share + x * density), [], [share], {
+        [checked!(g * (share + x * density), g * x, [], [share], {
             let share = g.wide() * wide_sigmoid(x);
             share.narrow() + (share * wide_sigmoid(-x) * x.wide()).narrow()
         })]

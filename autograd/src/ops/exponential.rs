@@ -135,6 +135,7 @@ impl Formula<1> for Rsqrt {
         let half = y.like(-0.5);
         [checked!(
             g * y * y * (y * half),
+            g,
             [g],
             [],
             (g.wide() * y.wide() * y.wide() * (y.wide() * half.wide())).narrow()

@@ -53,7 +53,7 @@ impl Formula<2> for Huber {
         let r = a - b;
         // With m, the smaller of |r| and delta, both are m (|r| - m / 2).
         let bounded = (r.abs() - delta).if_positive(delta, r.abs());
-        checked!(bounded * (r.abs() - half * bounded), [r], [], {
+        checked!(bounded * (r.abs() - half * bounded), r, [], [r], {
             let [scaled, scale] = scaled_difference(a, b);
             bounded * (scaled.abs() - half * bounded * scale) / scale
         })
@@ -86,11 +86,10 @@ impl Formula<2> for SmoothL1 {
     const WIDE_GRADIENT: bool = true;
     #[inline(always)]
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
-        let half = a.like(0.5);
-        let (beta, width) = (a.like(self.beta), a.like(self.width()));
-        let r = a - b;
+        let (half, beta) = (a.like(0.5), a.like(self.beta));
+        let (r, width) = (a - b, SmoothL1::width(beta));
         let near = half * product_over(r, r, width);
-        let far = checked!(r.abs() - half * beta, [r], [], {
+        let far = checked!(r.abs() - half * beta, r, [], [r], {
             let [scaled, scale] = scaled_difference(a, b);
             (scaled.abs() - half * beta * scale) / scale
         });
@@ -98,8 +97,8 @@ impl Formula<2> for SmoothL1 {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
-        let (r, beta, width) = (a - b, a.like(self.beta), a.like(self.width()));
-        let near = product_over(g, r, width);
+        let (r, beta) = (a - b, a.like(self.beta));
+        let near = product_over(g, r, SmoothL1::width(beta));
         let far = r.if_positive(g, (-r).if_positive(-g, g * r));
         let da = (beta - r.abs()).if_positive(near, far);
         [da, -da]
@@ -116,10 +115,10 @@ impl Formula<2> for SmoothL1 {
 }
 
 impl SmoothL1 {
-    /// The divisor of the parabola; arbitrary if beta is 0.
+    /// The divisor of the parabola; 1 if beta is 0, or rounds to 0.
     #[inline(always)]
-    fn width(&self) -> f64 {
-        if self.beta == 0.0 { 1.0 } else { self.beta }
+    fn width<E: Real>(beta: E) -> E {
+        beta.if_positive(beta, beta.like(1.0))
     }
 }
 
@@ -136,8 +135,10 @@ impl Formula<2> for BinaryCrossEntropy {
         let (zero, one) = (a.like(0.0), a.like(1.0));
         // softplus(+-a) = softplus(-|a|) + max(+-a, 0).
         let tail = (-a.abs()).softplus();
-        let against = (one - b) * a.if_positive(a, zero);
-        let towards = b * (-a).if_positive(-a, zero);
+        // A perfect prediction has no loss, even an infinite one.
+        let times = |share: E, distance: E| share.abs().if_positive(share * distance, share);
+        let against = times(one - b, a.if_positive(a, zero));
+        let towards = times(b, (-a).if_positive(-a, zero));
         tail + against + towards
     }
     #[inline(always)]

@@ -3,7 +3,7 @@
 use crate::cases::INF;
 use crate::slopes::{checked, product_over};
 use crate::{Axes, Cases, Formula, Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::scale::powers;
+use raygrad_tensor::scale::{power_of_two, scales};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, Wide, broadcast_shape, norm_to, variance_to};
 
 /// y = g a / b, where a part of it may be out of range.
@@ -21,7 +21,8 @@ impl Formula<3> for Ratio {
     fn vjp<E: Real>(&self, s: E, [g, a, b]: [E; 3], _y: E) -> [E; 3] {
         let db = -checked!(
             s * g / b * (a / b),
-            [s, g, a, b],
+            s,
+            [s, g, s * g, a, b],
             [],
             (s.wide() * g.wide() / b.wide() * (a.wide() / b.wide())).narrow()
         );
@@ -81,7 +82,11 @@ impl<T: Scalar> Op<T> for Variance {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let half = cx.g().constant(0.5 * self.divisor(cx.shape(0)));
-        Grads::one(Ratio.on([cx.g(), &cx.x(0).centred(&self.shape), &half]))
+        let x = cx.x(0);
+        Grads::one(match middle(&x, &self.shape, cx.pool()) {
+            None => Ratio.on([cx.g(), &x.centred(&self.shape), &half]),
+            Some(factor) => Ratio.on([cx.g(), &(x * &factor).centred(&self.shape), &(half * factor)]),
+        })
     }
 }
 
@@ -107,15 +112,34 @@ impl<T: Scalar> Op<T> for Deviation {
         let divisor = self.0.divisor(cx.shape(0));
         let quotient =
             |x: Var<'t, T>, y: Var<'t, T>| Ratio.on([cx.g(), &x.centred(shape), &(unless_zero(&y) * divisor)]);
-        // Where deviations or their multiples may be out of range, in units of the deviation, rounded to a power of two. It
-        // cancels, so it is a constant.
-        let is_safe = |y: &T| y.to_f64() == 0.0 || (1e-25..1e25).contains(&y.to_f64());
-        if y.value().as_slice().iter().all(is_safe) {
-            return Grads::one(quotient(x, y));
-        }
-        let down = cx.constant(y.value().map(|y| powers(y)[0]));
-        Grads::one(quotient(x * &down, y * down))
+        let is_safe = |y: T| (1e-25..1e25).contains(&y.to_f64());
+        let factor = if y.value().iter().all(is_safe) { None } else { middle(&x, shape, cx.pool()) };
+        Grads::one(match factor {
+            None => quotient(x, y),
+            Some(factor) => {
+                let x = x * factor;
+                let y = x.tape().apply(self.clone(), &[&x]);
+                quotient(x, y)
+            }
+        })
     }
+}
+
+/// For each line of `x`, a power of two that takes elements close to the ends of the range away from them; none if there
+/// are no such lines. It is a constant, since it cancels.
+fn middle<'t, T: Scalar>(x: &Var<'t, T>, kept: &[usize], pool: &Pool<T>) -> Option<Var<'t, T>> {
+    let [down, _] = scales(x.value(), kept, pool);
+    // `scales` ends at 2^-100 and 2^100, or 2^-1000 and 2^1000.
+    let end = power_of_two(if size_of::<T>() == 4 { 90 } else { 990 });
+    let factor = |down: T| match down.to_f64() {
+        up if up > end => down,
+        // Sums of some deviations stay in range, and small elements keep their digits.
+        down if down < 1.0 / end => T::from_f64(power_of_two(-8)),
+        _ => T::ONE,
+    };
+    let factor = down.map(factor);
+    let is_any = factor.iter().any(|factor| factor != T::ONE);
+    is_any.then(|| x.tape().constant(factor))
 }
 
 /// `y`, and infinity where it is 0: a quotient by it is 0 there, and so are its derivatives.
@@ -149,7 +173,20 @@ impl<T: Scalar> Op<T> for Norm {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(Ratio.on([cx.g(), &cx.x(0), &unless_zero(&cx.y())]))
+        let (x, y) = (cx.x(0), cx.y());
+        let quotient = |x: &Var<'t, T>, y: &Var<'t, T>| Grads::one(Ratio.on([cx.g(), x, &unless_zero(y)]));
+        // A length that is a subnormal number has lost digits.
+        let least = if size_of::<T>() == 4 { f32::MIN_POSITIVE.into() } else { f64::MIN_POSITIVE };
+        if y.value().iter().all(|y| y.to_f64() >= least) {
+            return quotient(&x, &y);
+        }
+        match middle(&x, &self.shape, cx.pool()).map(|factor| factor.maximum(1.0)) {
+            None => quotient(&x, &y),
+            Some(factor) => {
+                let x = x * factor;
+                quotient(&x, &x.tape().apply(self.clone(), &[&x]))
+            }
+        }
     }
 }
 

@@ -129,13 +129,18 @@ impl<T: Scalar> Op<T> for LogSumExp {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (x, y) = (cx.x(0), cx.y());
-        let mut column = Shape::from_slice(y.shape());
-        column.push(1);
-        // x - y would be NaN where both are -inf; there e^x is the 0 that is wanted.
-        let nothing = y.elementwise_eq(f64::NEG_INFINITY);
-        let y = y.constant(0.0).where_(&nothing, &y).reshape(&column);
-        Grads::one(power_times(&(x - y), &cx.g().reshape(&column)))
+        let (x, g) = (cx.x(0), cx.g());
+        if cx.recording() {
+            let mut column = Shape::from_slice(g.shape());
+            column.push(1);
+            let is_lost = cx.output().map(|y| if y == T::from_f64(f64::NEG_INFINITY) { T::ONE } else { T::ZERO });
+            let is_lost = is_lost.reshape(&column).broadcast_to(x.shape()).gt(T::ZERO);
+            // The logarithms of a row of -inf are NaN.
+            let logarithms = x.constant(f64::NEG_INFINITY).where_(&is_lost, x.log_softmax(-1));
+            return Grads::one(power_times(&logarithms, &g.reshape(&column)));
+        }
+        let kernel = |x: &[T], n, out: &mut [T]| rows::logsumexp_rows_grad(x, n, g.value().as_slice(), out, cx.pool());
+        Grads::one(cx.constant(by_rows(x.value(), cx.pool(), kernel)))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {

@@ -5,7 +5,8 @@
     python exact.py 5000 dense.bin        # 10^5 values; EXACT=$PWD/dense.bin cargo test -p raygrad-autograd exact
 
 Records of 32 bytes, little-endian: the argument x; the value as the sum of two f64 times a power of two, whose exponent
-is an i64. Functions follow each other with COUNT records each. Arguments are drawn evenly over exponents.
+is an i64. Functions follow each other with COUNT records each. Arguments are drawn evenly over exponents, and half of
+them over those of ordinary numbers.
 """
 
 import math
@@ -50,10 +51,16 @@ def main():
     mp.prec = 3000
     with path.open("wb") as out:
         for f, (low, high), signed in CASES:
-            for _ in range(count):
-                x = math.ldexp(random.uniform(1, 2), random.randint(low, high - 1))
+            written = 0
+            while written < count:
+                # Half of them where functions bend.
+                first, last = (max(low, -4), min(high, 6)) if random.random() < 0.5 else (low, high)
+                x = math.ldexp(random.uniform(1, 2), random.randint(first, last - 1))
                 x = -x if signed and random.random() < 0.5 else x
                 y = f(mpf(x))
+                if y == 0:
+                    continue
+                written += 1
                 exponent = int(mp.floor(mp.log(abs(y), 2)))
                 scaled = y * mpf(2) ** -exponent
                 first = float(scaled)

@@ -2,6 +2,7 @@
 
 use super::{ROW_ELEMENT, block, blocks, check_rows, check_whole, fold_lanes, total, totals_of};
 use crate::parallel::chunks;
+use crate::scale::power_of_two;
 use crate::{Pool, Scalar, Tensor, simd};
 
 /// The largest element of a row without NaN; a row with NaN results in NaN anyway.
@@ -80,6 +81,18 @@ fn large_multiples<T: Scalar>(logarithms: &[T], factor: T, out: &mut [T]) {
     );
 }
 
+/// `g - powers * sum g` in place of the powers, where the sum is out of range.
+#[cold]
+#[inline(never)]
+fn large_differences<T: Scalar>(g: &[T], powers: &mut [T]) {
+    let [down, up] = [-40, 40].map(|exponent| T::from_f64(power_of_two(exponent)));
+    let small: Vec<T> = g.iter().map(|&g| g * down).collect();
+    let sum = total(&small);
+    for (out, &g) in powers.iter_mut().zip(&small) {
+        *out = (g - *out * sum) * up;
+    }
+}
+
 /// Softmax of each row of `n` elements: `e^(x - max) / sum e^(x - max)`.
 ///
 /// # Panics
@@ -107,7 +120,8 @@ pub fn softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>)
     });
 }
 
-/// The gradient of softmax from its output: `y (g - sum g y)` in each row.
+/// The gradient of softmax from its output: `y (g - sum g y)` in each row. A probability that has underflowed has
+/// gradient 0, also where a large `g` would bring it back into range.
 ///
 /// # Panics
 /// If `y` is not whole rows of `n`, or `g` or `out` is shorter than `y`.
@@ -117,6 +131,9 @@ pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
     if y.is_empty() {
         return;
     }
+    // Up to this size, no difference from a mean overflows.
+    let largest_mean = T::from_f64(power_of_two(if size_of::<T>() == 4 { 100 } else { 960 }));
+    let quarter = [0.25, 4.0].map(T::from_f64);
     blocks(&mut out[..y.len()], n, 0, &Pool::none(), &|_, start, out| {
         let len = out.len();
         let (y, g) = (&y[start..][..len], &g[start..][..len]);
@@ -130,8 +147,9 @@ pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
                         #[inline(always)]
                         |y, g| [y * g],
                     );
+                    let [down, up] = if mean.abs() > largest_mean { quarter } else { [T::ONE; 2] };
                     for i in 0..n {
-                        out[i] = y[i] * (g[i] - mean);
+                        out[i] = y[i] * (g[i] * down - mean * down) * up;
                     }
                 }
             },
@@ -189,6 +207,10 @@ pub fn log_softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T
                 exponentials(out);
                 for ((out, y), g) in out.chunks_exact_mut(n).zip(y.chunks_exact(n)).zip(g.chunks_exact(n)) {
                     let sum = total(g);
+                    if !sum.is_finite() {
+                        large_differences(g, out);
+                        continue;
+                    }
                     let mut factor = sum;
                     if lifts(sum, y, [-87.0, -708.0]) {
                         large_multiples(y, sum, out);
@@ -254,16 +276,30 @@ pub fn cross_entropy_rows<T: Scalar>(x: &[T], n: usize, classes: &[u32], out: &m
     ln_sums(x, n, out, pool, |row, shift, ln| (shift - x[row * n..][..n][classes[row] as usize]) + ln);
 }
 
-/// The gradient of [`cross_entropy_rows`]: `g (softmax - 1 at the class)`. Where 1 minus the probability of the class
-/// would lose digits, it sums the probabilities of the other classes.
+/// The gradient of [`logsumexp_rows`]: `g` times the softmax of each row; 0 for a row of -inf alone.
 ///
 /// # Panics
-/// If `x` is not a row for each class, or a class is not below `n`. If `g` has another length than `classes`, or `out`
-/// is shorter than `x`.
+/// If `x` is not `g.len()` rows of `n`, or `out` is shorter than `x`.
 #[track_caller]
-pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g: &[T], out: &mut [T], pool: &Pool<T>) {
-    assert_eq!(classes.len(), g.len(), "a class for each gradient");
-    check_rows(x.len(), n, classes.len());
+pub fn logsumexp_rows_grad<T: Scalar>(x: &[T], n: usize, g: &[T], out: &mut [T], pool: &Pool<T>) {
+    softmax_multiples(x, n, g, out, pool, |_, row, is_lost| {
+        if is_lost {
+            row.fill(T::ZERO);
+        }
+    });
+}
+
+/// `g` times the softmax of each row, which `finish(row number, multiples, whether all elements are -inf)` may change.
+#[track_caller]
+fn softmax_multiples<T: Scalar>(
+    x: &[T],
+    n: usize,
+    g: &[T],
+    out: &mut [T],
+    pool: &Pool<T>,
+    finish: impl Fn(usize, &mut [T], bool) + Sync,
+) {
+    check_rows(x.len(), n, g.len());
     softmax_rows(x, n, out, pool);
     if x.is_empty() {
         return;
@@ -274,24 +310,37 @@ pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g:
             #[inline(always)]
             || {
                 let rows = out.chunks_exact_mut(n).zip(x[start..].chunks_exact(n));
-                for (((row, x), &class), &g) in rows.zip(&classes[first..]).zip(&g[first..]) {
-                    let is_lifted = lifts(g, row, [f32::MIN_POSITIVE.into(), f64::MIN_POSITIVE]);
-                    if is_lifted {
+                for (i, ((row, x), &g)) in rows.zip(&g[first..]).enumerate() {
+                    let greatest = top(x);
+                    if lifts(g, row, [f32::MIN_POSITIVE.into(), f64::MIN_POSITIVE]) {
                         // The power of the greatest logit is 1.
-                        let (greatest, scale) = (top(x), top(row));
+                        let scale = top(row);
                         let shifted: Vec<T> = x.iter().map(|&x| x - greatest).collect();
                         large_multiples(&shifted, g * scale, row);
-                    }
-                    row[class as usize] = T::ZERO;
-                    row[class as usize] = -total(row);
-                    if !is_lifted {
-                        for out in row {
+                    } else {
+                        for out in &mut *row {
                             *out *= g;
                         }
                     }
+                    finish(first + i, row, greatest == T::from_f64(f64::NEG_INFINITY));
                 }
             },
         );
+    });
+}
+
+/// The gradient of [`cross_entropy_rows`]: `g (softmax - 1 at the class)`. Where 1 minus the probability of the class
+/// would lose digits, it sums the probabilities of the other classes.
+///
+/// # Panics
+/// If `x` is not a row for each class, or a class is not below `n`. If `g` has another length than `classes`, or `out`
+/// is shorter than `x`.
+#[track_caller]
+pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g: &[T], out: &mut [T], pool: &Pool<T>) {
+    assert_eq!(classes.len(), g.len(), "a class for each gradient");
+    softmax_multiples(x, n, g, out, pool, |i, row, _| {
+        row[classes[i] as usize] = T::ZERO;
+        row[classes[i] as usize] = -total(row);
     });
 }
 

@@ -137,7 +137,7 @@ impl Exact {
         y.shifted(half)
     }
 
-    /// Half of the numbers round to even, as f64 does.
+    /// The nearest whole number; ties go to the even one.
     fn round(self) -> f64 {
         self.to_f64().round_ties_even()
     }

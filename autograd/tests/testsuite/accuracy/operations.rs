@@ -65,7 +65,7 @@ fn density(x: Exact) -> Exact {
     (-x.square().shifted(-1)).exp() / Exact::PI.shifted(1).sqrt()
 }
 
-/// `x / sqrt(a^2 + b^2)^n`.
+/// `x / (a^2 + b^2)`.
 fn over_length(x: Exact, a: Exact, b: Exact) -> Exact {
     x / (a.square() + b.square())
 }
@@ -370,7 +370,7 @@ fn with_constants<T: Scalar>() -> Vec<Operation<T>> {
     vec![
         row("powf, any", 1, |v, [p, _]| v[0].powf(p), |x, [p, _]| constant_power(x[0], p), |c| c),
         row("powi, any", 1, |v, [n, _]| v[0].powi(n as i32), |x, [n, _]| constant_power(x[0], n), exponent),
-        row("elu, any", 1, |v, [alpha, _]| v[0].elu(alpha), |x, [alpha, _]| elu(x[0], alpha), positive),
+        row("elu, any", 1, |v, [alpha, _]| v[0].elu(alpha), |x, [alpha, _]| elu(x[0], alpha), |c| c),
         row(
             "leaky_relu, any",
             1,
@@ -379,7 +379,7 @@ fn with_constants<T: Scalar>() -> Vec<Operation<T>> {
                 let slope = Exact::new(if x[0] > 0.0 { 1.0 } else { slope });
                 of(Exact::new(x[0]) * slope, [slope])
             },
-            positive,
+            |c| c,
         ),
         row(
             "affine, any",
@@ -387,7 +387,7 @@ fn with_constants<T: Scalar>() -> Vec<Operation<T>> {
             |v, [scale, shift]| v[0].affine(scale, shift),
             |x, [scale, shift]| {
                 let scale = Exact::new(scale);
-                with_terms(sum(Exact::new(x[0]) * scale, Exact::new(shift)), [(scale, scale)])
+                of(Exact::new(x[0]) * scale + Exact::new(shift), [scale])
             },
             |c| c,
         ),

@@ -18,6 +18,9 @@ use std::ops::Range;
 /// Cases that are evaluated together.
 const BATCH: usize = 1 << 12;
 
+/// An odd number: its multiples modulo 2^32 are all bit patterns, and the first ones are spread evenly.
+const SPREAD: u32 = 0x9e37_79b1;
+
 /// The error of `got` in units in the last place of f32, from a result of f64.
 fn quick_error(got: f64, exact: f64) -> f64 {
     const LIMIT: f64 = 2.0 * (1_u128 << 127) as f64;
@@ -35,28 +38,28 @@ fn quick_error(got: f64, exact: f64) -> f64 {
 
 /// An incoming gradient as [`Random::gradient`] has it, in less time: of any bits, or so that its product with a
 /// derivative of this slope is a number of any size.
-fn incoming(random: &mut Random, is_any: bool, slope: f64) -> f64 {
+fn incoming(random: &mut Random, slope: f64) -> f64 {
     let bits = random.bits();
     let any = f32::from_bits(bits as u32);
     let exponent = (slope.to_bits() >> 52 & 0x7ff) as i64 - 1023;
-    if is_any || exponent < -1022 || exponent > 1023 {
+    if (bits >> 32) & 1 == 0 || !(-1022..=1023).contains(&exponent) {
         return if any.is_finite() { any.into() } else { 0.0 };
     }
-    let target = -149 + ((bits >> 32) * 277 >> 32) as i64;
-    let power = f64::from_bits(((target - exponent).clamp(-149, 127) + 1023 << 52) as u64);
+    let target = -149 + (((bits >> 32) * 277) >> 32) as i64;
+    let power = f64::from_bits((((target - exponent).clamp(-149, 127) + 1023) as u64) << 52);
     let significand = f64::from(f32::from_bits(bits as u32 & 0x807f_ffff | 127 << 23));
     f64::from((significand * power) as f32)
 }
 
 /// The errors of the cases with these numbers, which have the same constants.
-fn examine(single: &Operation<f32>, double: &Operation<f64>, cases: Range<u64>, step: u64) -> Vec<Column> {
+fn examine(single: &Operation<f32>, double: &Operation<f64>, cases: Range<u64>) -> Vec<Column> {
     let (n, operands) = ((cases.end - cases.start) as usize, single.operands);
     let constants = constants(single, cases.start as usize);
     let mut random = Random::of(single.name, cases.start);
     let mut x = vec![Vec::with_capacity(n); operands];
     for case in cases {
         if operands == 1 {
-            x[0].push(f64::from(f32::from_bits((case * step) as u32)));
+            x[0].push(f64::from(f32::from_bits((case as u32).wrapping_mul(SPREAD))));
         } else {
             let drawn = (0..operands).map(|_| random.argument::<f32>()).collect();
             let drawn = (single.domain)(random.related::<f32>(drawn));
@@ -67,7 +70,7 @@ fn examine(single: &Operation<f32>, double: &Operation<f64>, cases: Range<u64>, 
     let slopes: Vec<&[f64]> = slopes[1..].iter().map(|slopes| slopes.as_slice()).collect();
     let mut g = Vec::with_capacity(n);
     for i in 0..n {
-        g.push(incoming(&mut random, i % 2 == 0, slopes[i / 2 % operands][i]));
+        g.push(incoming(&mut random, slopes[i / 2 % operands][i]));
     }
     let narrow = |x: &[f64]| x.iter().map(|&x| x as f32).collect::<Vec<_>>();
     let results = evaluate(single, constants, x.iter().map(|x| narrow(x)).collect(), narrow(&g));
@@ -90,7 +93,9 @@ fn examine(single: &Operation<f32>, double: &Operation<f64>, cases: Range<u64>, 
                 continue;
             }
             let error = quick_error(got.into(), reference);
-            if !(error < 0.99 * gate) {
+            // Both may be NaN for no reason.
+            let is_lost = got.is_nan() && !x(i).iter().any(|x| x.is_nan());
+            if is_lost || !(error < 0.99 * gate) {
                 add(i);
                 continue;
             }
@@ -116,12 +121,10 @@ fn singles_agree_with_doubles() {
     let rows = rows.filter(|(row, _)| is_asked(row.name, row.operands));
     let failed: Vec<String> = rows
         .flat_map(|(single, double)| {
-            // Every `step`-th bit pattern, of all exponents.
-            let step = ((1 << 32) / cases).max(1) | 1;
-            let size = if single.constants.is_some() { 128 } else { BATCH as u64 };
+            let size = if single.constants.is_some() { 16 } else { BATCH as u64 };
             let columns = (0..cases.div_ceil(size))
                 .into_par_iter()
-                .map(|part| examine(&single, &double, part * size..((part + 1) * size).min(cases), step))
+                .map(|part| examine(&single, &double, part * size..((part + 1) * size).min(cases)))
                 .reduce(
                     || vec![Column::default(); 1 + single.operands],
                     |a, b| a.into_iter().zip(b).map(|(a, b)| a.joined(b)).collect(),
