@@ -274,7 +274,7 @@ pub(crate) fn powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
     let factor = x.like(f64::from(n));
     match n {
         1 => s,
-        2 => s * x * factor,
+        2 => s * (x * factor),
         3 => checked!(s * x * x * factor, s, [s, x], [], (s.wide() * x.wide() * x.wide() * factor.wide()).narrow()),
         4 => checked!(
             s * x * x * x * factor,
