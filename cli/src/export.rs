@@ -10,6 +10,7 @@ use raygrad::nerf::dataset::formats::transforms;
 use raygrad::nerf::dataset::{Capture, Split};
 use raygrad::nerf::geometry::files::Format;
 use raygrad::nerf::{Error, Model, Result, write_atomic};
+use raygrad::nn::TEMPORARY_PREFIX;
 use serde_json::json;
 
 use super::builtin;
@@ -159,7 +160,7 @@ fn write(mut capture: Capture, out: &Path, job: &Job) -> Result<()> {
         view.name = relative(&capture.folder, view)?;
     }
     let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
-    let folder = tempfile::tempdir_in(parent(out)).map_err(bad)?;
+    let folder = tempfile::Builder::new().prefix(TEMPORARY_PREFIX).tempdir_in(parent(out)).map_err(bad)?;
     transforms::write(&capture, folder.path())?;
     let text = std::fs::read_to_string(folder.path().join("transforms.json")).map_err(bad)?;
     // An extra field for the mark. Other programs ignore unknown fields.

@@ -18,6 +18,11 @@ pub fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
+/// JSON for a script element, which neither `</script>` nor `<!--<script>` in it may end or extend.
+pub fn in_script(json: &str) -> String {
+    json.replace('<', "\\u003c")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -27,5 +32,8 @@ mod tests {
         let page = filled("a {{x}} b {{y}} {{x}}{{z}}.", &[("x", "{{y}}".to_owned()), ("y", "2".to_owned())]);
         assert_eq!(page, "a {{y}} b 2 {{y}}.");
         assert_eq!(escaped("<a & \"b\">"), "&lt;a &amp; &quot;b&quot;&gt;");
+        let json = in_script(&serde_json::json!("<!--<script></script>").to_string());
+        assert!(!json.contains('<'));
+        assert_eq!(serde_json::from_str::<String>(&json).unwrap(), "<!--<script></script>");
     }
 }

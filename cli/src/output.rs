@@ -1,13 +1,15 @@
 //! Terminal output, and output folders.
 
+use std::borrow::Cow;
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::imaging::colormap;
-use raygrad::nerf::{Error, Image, Render, Result};
+use raygrad::nerf::{Error, Image, Render, Result, create_folder};
 
 /// Writes to standard output. A closed pipe (`raygrad eval run | head -1`) or a closed terminal is not an error.
 pub fn print(text: &str) -> Result<()> {
+    let text = printable(text);
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Err(e) if !is_gone(&e, is_device(&out)) => Err(Error::setting("stdout", format!("cannot be written: {e}"))),
@@ -37,7 +39,25 @@ fn is_device<T>(_: &T) -> bool {
 
 /// Writes a line to standard error. Ignores errors, unlike `eprintln`, which panics if standard error is closed.
 pub fn note(line: &str) {
-    let _ = writeln!(std::io::stderr(), "{line}");
+    let _ = writeln!(std::io::stderr(), "{}", printable(line));
+}
+
+/// The text with escapes in place of control characters, which a terminal would obey. Names of files have any.
+fn printable(text: &str) -> Cow<'_, str> {
+    let is_obeyed = |c: char| c.is_control() && !"\n\t".contains(c);
+    if !text.contains(is_obeyed) {
+        return text.into();
+    }
+    text.chars()
+        .fold(String::new(), |mut text, c| {
+            if is_obeyed(c) {
+                text.extend(c.escape_default())
+            } else {
+                text.push(c)
+            }
+            text
+        })
+        .into()
 }
 
 /// Writes a warning or an error to standard error.
@@ -71,7 +91,7 @@ pub fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
 
 /// Creates a folder with its parents and checks that it is writable.
 pub fn make_folder(folder: &Path) -> Result<()> {
-    std::fs::create_dir_all(folder).map_err(|e| Error::file(folder, format!("cannot be created: {e}")))?;
+    create_folder(folder)?;
     check_writable(folder)
 }
 

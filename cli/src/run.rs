@@ -5,14 +5,16 @@ use std::fs::DirEntry;
 use std::io::ErrorKind;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use raygrad::nerf::{Budget, Config, Error, Model, Result, SceneBox, write_atomic};
+use raygrad::nn::TEMPORARY_PREFIX;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::cameras::Viewpoint;
 use super::lock::{Lock, State};
-use super::output::{make_folder, parent, remove};
+use super::output::{complain, make_folder, parent, remove};
 use super::scene::Scene;
 
 /// Default folder of a run. Further runs use `run-2`, `run-3` ...
@@ -42,7 +44,7 @@ const OWN: [&str; 9] = [
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// Version of raygrad that made the run.
+    /// Version of raygrad that trained the run last.
     pub raygrad: String,
     /// Source of the images.
     pub scene: Scene,
@@ -160,11 +162,23 @@ impl Run {
         Ok(true)
     }
 
-    /// Removes temporary files of a killed program.
+    /// Removes temporary files of a killed program, and its folders from the day after on.
     pub fn sweep(&self) {
-        let folders = ["", "checkpoints", "previews", "tensorboard"].map(|name| self.file(name));
+        let folders = ["", "checkpoints", "previews", "tensorboard", "videos"].map(|name| self.file(name));
         let entries = folders.into_iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten().flatten();
-        remove(&entries.filter(is_unfinished).map(|entry| entry.path()).collect::<Vec<_>>());
+        let unfinished = entries.filter(is_unfinished).map(|entry| entry.path());
+        let (folders, files): (Vec<_>, Vec<_>) = unfinished.partition(|path| path.is_dir() && !path.is_symlink());
+        remove(&files);
+        // Another program may be writing a video.
+        let is_old = |folder: &PathBuf| {
+            let age = folder.metadata().and_then(|about| about.modified()).map(|time| time.elapsed());
+            age.is_ok_and(|age| age.is_ok_and(|age| age > DAY))
+        };
+        for folder in folders.into_iter().filter(is_old) {
+            if let Err(e) = std::fs::remove_dir_all(&folder) {
+                complain(&format!("{}: cannot be removed: {e}", folder.display()));
+            }
+        }
     }
 
     /// The path of a file of the run.
@@ -303,9 +317,11 @@ fn is_nothing(entry: &DirEntry) -> bool {
     is_unfinished(entry) || [LOCK, OWNER].iter().any(|name| entry.file_name() == *name)
 }
 
+const DAY: Duration = Duration::from_secs(24 * 3600);
+
 /// Returns true for temporary files of unfinished writes.
 fn is_unfinished(entry: &DirEntry) -> bool {
-    entry.file_name().to_string_lossy().starts_with(".tmp")
+    entry.file_name().to_string_lossy().starts_with(TEMPORARY_PREFIX)
 }
 
 /// Contents of a path.

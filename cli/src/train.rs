@@ -288,8 +288,14 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     checkpoint::load(&run, &mut trainer)?;
     run.keep(&mut lock)?;
     let kept = args.keep_checkpoints.unwrap_or(run.config.keep_checkpoints);
-    if (run.config.budget, run.config.keep_checkpoints) != (Some(budget), kept) {
-        (run.config.budget, run.config.keep_checkpoints) = (Some(budget), kept);
+    let last = RunConfig {
+        raygrad: env!("CARGO_PKG_VERSION").to_owned(),
+        budget: Some(budget),
+        keep_checkpoints: kept,
+        ..run.config.clone()
+    };
+    if run.config != last {
+        run.config = last;
         run.write()?;
     }
     describe(&run, &trainer, &data, &scene)?;

@@ -1,4 +1,4 @@
-//! Atomic writing of files.
+//! Files that are on the disk, or not there at all.
 
 use crate::error::{Error, Result};
 use std::path::Path;
@@ -11,6 +11,25 @@ use std::path::Path;
 pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     let path = path.as_ref();
     raygrad_nn::write_atomic(path, bytes).map_err(|e| Error::file(path, format!("cannot be written: {e}")))
+}
+
+/// Renames a file, or a folder with all that it holds, such that a loss of power leaves all of it at one of both paths.
+/// See [`raygrad_nn::rename_durable`].
+///
+/// # Errors
+/// If the contents cannot be flushed or the rename fails; the error names `to`.
+pub fn rename_durable(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> {
+    let to = to.as_ref();
+    raygrad_nn::rename_durable(from, to).map_err(|e| Error::file(to, format!("cannot be written: {e}")))
+}
+
+/// Creates a folder with its parents, which a loss of power then leaves in place. See [`raygrad_nn::create_folder`].
+///
+/// # Errors
+/// If a folder cannot be created; the error names `folder`.
+pub fn create_folder(folder: impl AsRef<Path>) -> Result<()> {
+    let folder = folder.as_ref();
+    raygrad_nn::create_folder(folder).map_err(|e| Error::file(folder, format!("cannot be created: {e}")))
 }
 
 #[cfg(test)]

@@ -97,7 +97,7 @@ pub use field::{
     Classic, ClassicConfig, Density, DensityActivation, Field, FieldConfig, Fields, Instant, InstantConfig,
 };
 pub use field::{ViewInputs, Voxel, VoxelConfig};
-pub use files::write_atomic;
+pub use files::{create_folder, rename_durable, write_atomic};
 pub use glam;
 pub use imaging::quantise;
 pub use losses::{Loss, LossTerm, LossTermConfig, LossTerms};

@@ -45,7 +45,7 @@ mod storage;
 mod tiles;
 
 #[cfg(feature = "files")]
-pub use files::write_atomic;
+pub use files::{TEMPORARY_PREFIX, create_folder, rename_durable, write_atomic};
 pub use layers::{Conv2d, Dropout, Embedding, Init, Layer, LayerNorm, Linear, Mlp, Mode, Sequential};
 #[cfg(feature = "files")]
 pub use npz::NpzError;

@@ -9,7 +9,7 @@ use raygrad::nerf::{Error, Result};
 
 use super::stage::Stage;
 use super::table;
-use crate::html::{escaped, filled};
+use crate::html::{escaped, filled, in_script};
 
 /// The template of the page.
 const PAGE: &str = include_str!("page.html");
@@ -30,8 +30,7 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage, mark: &str) -> Re
         findings = "<p class=\"good\">No problems found.</p>".to_owned();
     }
     let data = serde_json::to_string(stage).map_err(|e| Error::setting("page", e))?;
-    // The data must not end the script element.
-    let data = data.replace("</", "<\\/");
+    let data = in_script(&data);
     let title = escaped(&report.facts.folder.display().to_string());
     let texts =
         [("title", title), ("facts", facts), ("findings", findings), ("stage", data), ("mark", mark.to_owned())];

@@ -14,7 +14,9 @@ use raygrad::nerf::imaging::colormap;
 use raygrad::nerf::imaging::lpips::{Backbone, Lpips};
 use raygrad::nerf::imaging::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
-use raygrad::nerf::{Background, Error, Evaluations, Image, Render, Result, fitted_cameras, write_atomic};
+use raygrad::nerf::{
+    Background, Error, Evaluations, Image, Render, Result, fitted_cameras, rename_durable, write_atomic,
+};
 
 use super::lock::{Lock, State};
 use super::machine::processor;
@@ -228,8 +230,7 @@ pub fn run(args: &Args) -> Result<()> {
     // The result is replaced only after the evaluation is complete.
     write_json(&file, &report)?;
     for name in drawn.iter().map(|&i| numbered(i, DIGITS)) {
-        let (from, to) = (unfinished.join(&name), pictures.join(&name));
-        std::fs::rename(from, &to).map_err(|e| Error::file(&to, format!("cannot be written: {e}")))?;
+        rename_durable(unfinished.join(&name), pictures.join(&name))?;
     }
     let _ = std::fs::remove_dir(&unfinished);
     lock.remove();

@@ -13,7 +13,7 @@ use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::nerf::{Error, Model, Result, write_atomic};
 use serde_json::{Value, json};
 
-use crate::html::{escaped, filled};
+use crate::html::{escaped, filled, in_script};
 use crate::output::print;
 use crate::overwrite::Job;
 use crate::run::Run;
@@ -105,7 +105,7 @@ fn page(run: &Run, model: &Model<f32>, mark: &str) -> std::result::Result<String
         ("script", SCRIPT.to_owned()),
         ("shader", SHADER.to_owned()),
         // The data must not end the script element.
-        ("data", data.to_string().replace("</", "<\\/")),
+        ("data", in_script(&data.to_string())),
         ("files", files.to_string()),
         ("mark", mark.to_owned()),
     ];

@@ -1,12 +1,14 @@
 //! External programs: running them and reading their output.
 
 use std::collections::VecDeque;
+use std::ffi::OsString;
 use std::io::{BufRead, BufReader, ErrorKind, Read};
+use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::time::Duration;
 
-use raygrad::nerf::Error;
+use raygrad::nerf::{Error, Result};
 
 use crate::interrupt::{self, Stop, Work};
 use crate::output::note;
@@ -116,6 +118,14 @@ impl Program {
         };
         Error::setting(self.name, what).into()
     }
+}
+
+/// The name of a file for ffmpeg, which takes `2024-05-01T12:30.mp4` and `http:host` for protocols.
+pub fn file_url(file: &Path) -> Result<OsString> {
+    let absolute = std::path::absolute(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")))?;
+    let mut url = OsString::from("file:");
+    url.push(absolute);
+    Ok(url)
 }
 
 /// Returns true for progress lines of ffmpeg, such as `out_time_us=1240000`. They are left out of error messages.

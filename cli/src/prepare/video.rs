@@ -1,11 +1,12 @@
 //! Extraction of sharp frames.
 
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::Error;
 use raygrad::nerf::dataset::Photo;
 
-use super::program::FFMPEG;
+use super::program::{FFMPEG, file_url};
 use super::workplace::Workplace;
 use crate::interrupt::Work;
 use crate::output::entries;
@@ -28,7 +29,11 @@ struct Video {
 /// Writes about `count` sharp frames of a video to `images`. Of each three consecutive candidates, the sharpest is
 /// kept.
 pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
-    let said = FFMPEG.ask(&["-hide_banner".as_ref(), "-nostdin".as_ref(), "-i".as_ref(), video.as_os_str()])?;
+    let input = file_url(video)?;
+    let mut question: Vec<&OsStr> =
+        ["-hide_banner", "-nostdin", "-protocol_whitelist", "file", "-i"].map(OsStr::new).to_vec();
+    question.push(&input);
+    let said = FFMPEG.ask(&question)?;
     let Some(about) = Video::parse(&said) else {
         let last = said.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("nothing").trim();
         return Err(Error::file(video, format!("ffmpeg cannot read it as a video: {last}")).into());
@@ -38,10 +43,15 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
     let folder = place.make(FOLDER)?;
     let progress = Progress::new();
     let mut command = FFMPEG.command();
-    command.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-nostats", "-progress", "pipe:1", "-i"]);
-    command.arg(video).arg("-map").arg("0:v:0").arg("-vf").arg(format!("fps={rate:.6}"));
+    // ffmpeg runs in the folder, since it would read a `%` in the folder's name as a pattern.
+    command.current_dir(&folder);
+    command.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-nostats", "-progress", "pipe:1"]);
+    command.args(["-protocol_whitelist", "file", "-i"]).arg(&input);
+    command.arg("-map").arg("0:v:0").arg("-vf").arg(format!("fps={rate:.6}"));
+    // A file may be longer than it says.
+    command.args(["-frames:v", &(CANDIDATES * count + 1).to_string()]);
     // The best JPEG quality. ffmpeg uses 1 only if the minimum is 1 too.
-    command.args(["-qmin", "1", "-q:v", "1"]).arg(folder.join("%06d.jpg"));
+    command.args(["-qmin", "1", "-q:v", "1", "%06d.jpg"]);
     FFMPEG.run(&mut command, None, |line| {
         let Some(frame) = line.strip_prefix("frame=").and_then(|n| n.trim().parse::<f64>().ok()) else { return };
         progress.set(frame / wanted, || format!("{frame} of about {wanted:.0} frames extracted"));

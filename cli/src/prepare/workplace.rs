@@ -79,7 +79,7 @@ impl Workplace {
         let Workplace { temporary, out, is_inside } = self;
         // Disables the removal on drop, so that errors below keep the work.
         let done = temporary.keep();
-        let moved = if is_inside { move_up(&done, &out) } else { std::fs::rename(&done, &out) };
+        let moved = if is_inside { move_up(&done, &out) } else { raygrad::nn::rename_durable(&done, &out) };
         moved.map_err(|e| {
             let done = done.display();
             Error::file(&out, format!("cannot be written: {e}; the result is complete: move it from {done}"))
@@ -109,7 +109,7 @@ fn move_up(from: &Path, to: &Path) -> std::io::Result<()> {
     }
     for entry in std::fs::read_dir(from)? {
         let name = entry?.file_name();
-        std::fs::rename(from.join(&name), to.join(&name))?;
+        raygrad::nn::rename_durable(from.join(&name), to.join(&name))?;
     }
     std::fs::remove_dir(from)
 }

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use raygrad::nerf::{Error, Result, write_atomic};
+use raygrad::nerf::{Error, Result, create_folder, write_atomic};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -93,7 +93,7 @@ impl Frames {
             let file = beside(&self.folder, self.record.done, *layer);
             let folder = parent(&file);
             self.check_lock()?;
-            std::fs::create_dir_all(folder).map_err(|e| Error::file(folder, format!("cannot be created: {e}")))?;
+            create_folder(folder)?;
             write_atomic(file, bytes)?;
         }
         self.check_lock()?;

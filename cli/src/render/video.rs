@@ -5,7 +5,8 @@ use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
-use raygrad::nerf::{Error, Image, Result};
+use raygrad::nerf::{Error, Image, Result, rename_durable};
+use raygrad::nn::TEMPORARY_PREFIX;
 
 use super::animation::Animation;
 use super::frames::DIGITS;
@@ -13,7 +14,7 @@ use crate::interrupt::{self, Stop, Work};
 use crate::output::{check_writable, note, numbered, parent};
 use crate::overwrite::Job;
 use crate::parse::LARGEST;
-use crate::prepare::program::FFMPEG;
+use crate::prepare::program::{FFMPEG, file_url};
 use crate::progress::Progress;
 
 /// Largest frame rate of a GIF, with two hundredths of a second per frame. Players slow down faster ones.
@@ -92,7 +93,7 @@ impl VideoFormat {
     /// Writes the video and replaces the file atomically.
     pub fn write(self, reel: &VideoWriter<'_>, out: &Path) -> Work<()> {
         let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
-        let place = tempfile::Builder::new().prefix(".tmp").tempdir_in(parent(out)).map_err(bad)?;
+        let place = tempfile::Builder::new().prefix(TEMPORARY_PREFIX).tempdir_in(parent(out)).map_err(bad)?;
         let file = std::path::absolute(place.path()).map_err(bad)?.join("video");
         let size = reel.size.map(|side| side as u16);
         match self {
@@ -104,7 +105,7 @@ impl VideoFormat {
             VideoFormat::Mp4 | VideoFormat::Webm => self.encode(reel, out, &file)?,
         }
         reel.job.check(out)?;
-        Ok(std::fs::rename(&file, out).map_err(bad)?)
+        Ok(rename_durable(&file, out)?)
     }
 
     /// Encodes with ffmpeg.
@@ -131,7 +132,7 @@ impl VideoFormat {
             VideoFormat::Webm => &["-crf", "24", "-b:v", "0", "-f", "webm"][..],
             _ => &["-crf", "18", "-preset", "slow", "-movflags", "+faststart", "-f", "mp4"],
         });
-        command.arg(file);
+        command.arg(file_url(file)?);
         let progress = Progress::new();
         FFMPEG.run(&mut command, None, |line| {
             if let Some(done) = line.strip_prefix("frame=").and_then(|n| n.trim().parse().ok()) {

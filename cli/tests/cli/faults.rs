@@ -39,7 +39,7 @@ fn traced(place: &Place, fault: Option<&str>, arguments: &str) -> (Output, Vec<S
     let log = place.path("strace.log");
     let mut command = Command::new("strace");
     command.current_dir(place.path("")).args(["-f", "-qq", "-y", "-o"]).arg(&log);
-    command.args(["-e", "trace=mkdir,openat,write,fsync,renameat,unlink"]);
+    command.args(["-e", "trace=mkdir,openat,write,fsync,rename,renameat,unlink,rmdir"]);
     if let Some(fault) = fault {
         command.args(["-e", &format!("inject={fault}")]);
     }
@@ -163,4 +163,57 @@ fn faults_of_the_disk_lose_no_run() {
             "refused when {what} ({call}): {ended} ended with an error, {warned} with a warning, {silent} had ended before; {words}"
         );
     }
+}
+
+/// Panics unless calls of these names, whose lines contain these texts, follow each other.
+#[track_caller]
+fn assert_order(calls: &[String], expected: &[(&str, &str)]) {
+    let mut rest = calls.iter();
+    for (call, text) in expected {
+        let found = rest.any(|line| line.starts_with(&format!("{call}(")) && line.contains(text));
+        assert!(found, "no {call} of {text} in its order: {calls:#?}");
+    }
+}
+
+/// A loss of power keeps what was written before the sync: so contents come first, then the name, then what is deleted.
+#[test]
+fn faults_by_power_loss_keep_films_and_captures() {
+    if !has_strace() {
+        return;
+    }
+    let place = Place::with_scene();
+    place.succeeds(&begin());
+    let folder = place.path("").canonicalize().unwrap();
+    let folder = format!("<{}>", folder.display());
+    let (output, calls) = traced(&place, None, "--threads 1 render run --path test --size 8x6 --out film.gif");
+    assert!(output.status.success(), "{output:?}");
+    assert_order(
+        &calls,
+        &[
+            ("mkdir", "film.gif.frames"),
+            ("fsync", &folder),
+            ("fsync", "film.gif.frames/"),
+            ("renameat", "film.gif.frames/0000.png"),
+            ("fsync", "film.gif.frames>"),
+            ("fsync", "/video>"),
+            ("rename", "film.gif\""),
+            ("fsync", &folder),
+            ("unlink", "film.gif.frames/0000.png"),
+        ],
+    );
+    let (output, calls) = traced(&place, None, "--threads 1 prepare scene --to nerfstudio --out captured");
+    assert!(output.status.success(), "{output:?}");
+    let (mut folders, mut count) = (vec![place.path("captured")], 0);
+    while let Some(next) = folders.pop() {
+        for entry in std::fs::read_dir(next).unwrap().map(|entry| entry.unwrap().path()) {
+            if entry.is_dir() {
+                folders.push(entry);
+                continue;
+            }
+            count += 1;
+            let name = format!("/{}>", entry.strip_prefix(place.path("captured")).unwrap().display());
+            assert_order(&calls, &[("fsync", &name), ("rename", "captured\""), ("fsync", &folder)]);
+        }
+    }
+    assert!(count > 3, "{count} files");
 }

@@ -19,10 +19,11 @@ case "$*" in
 esac
 for out; do :; done
 folder=$(dirname "$out")
+from=$(dirname "$LOG")
 i=1
 while [ $i -le 30 ]; do
-  if [ $((i % 3)) -eq 2 ]; then from=sharp.jpg; else from=soft.jpg; fi
-  cp "$from" "$folder/$(printf %06d $i).jpg"
+  if [ $((i % 3)) -eq 2 ]; then image=sharp.jpg; else image=soft.jpg; fi
+  cp "$from/$image" "$folder/$(printf %06d $i).jpg"
   echo "frame=$i"
   i=$((i + 1))
 done
@@ -106,6 +107,19 @@ fn command(place: &Place, arguments: &str) -> Command {
 
 fn run(place: &Place, arguments: &str) -> Output {
     command(place, arguments).output().unwrap()
+}
+
+/// Names that ffmpeg would take for a protocol, an option or a pattern; and an end of frames, whatever the file says.
+#[test]
+fn video_names_reach_ffmpeg_as_files() {
+    let place = place();
+    for name in ["2024-05-01T12:30.mp4", "http:host.mp4", "./-i.mp4", "100%d.mp4"] {
+        std::fs::copy(place.path("walk.mp4"), place.path(name)).unwrap();
+        succeeds(&place, &format!("prepare {name} --out 50%d --frames 10"));
+        let own = format!("/{} ", name.trim_start_matches("./"));
+        assert!(ran(&place, &["-protocol_whitelist file -i file:/", &own, "-frames:v 31", " %06d.jpg"]), "{name}");
+        std::fs::remove_dir_all(place.path("50%d")).unwrap();
+    }
 }
 
 #[track_caller]

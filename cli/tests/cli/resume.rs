@@ -122,7 +122,16 @@ fn damaged_checkpoint_falls_back_to_the_previous() {
     let last = checkpoints(&place, "run").pop().unwrap();
     let bytes = std::fs::read(&last).unwrap();
     std::fs::write(&last, &bytes[..bytes.len() - 1]).unwrap();
-    std::fs::write(place.path("run/checkpoints/.tmp123"), b"half").unwrap();
+    std::fs::write(place.path("run/checkpoints/.raygrad-tmp-123"), b"half").unwrap();
+    let [old, new] = [".raygrad-tmp-456", ".raygrad-tmp-789"].map(|name| place.path("run").join(name));
+    for folder in [&old, &new] {
+        std::fs::create_dir(folder).unwrap();
+        std::fs::write(folder.join("video"), b"half").unwrap();
+    }
+    let yesterday = std::time::SystemTime::now() - Duration::from_secs(90_000);
+    File::open(&old).unwrap().set_modified(yesterday).unwrap();
+    // Files of others.
+    std::fs::write(place.path("run/.tmp-notes"), b"mine").unwrap();
     let output = place.command("train --resume run").output().unwrap();
     let message = String::from_utf8(output.stderr).unwrap();
     assert!(
@@ -131,7 +140,8 @@ fn damaged_checkpoint_falls_back_to_the_previous() {
     );
     assert!(String::from_utf8(output.stdout).unwrap().contains("resumed  at step 29\n"));
     assert_same(&place, "whole", "run");
-    assert!(!place.path("run/checkpoints/.tmp123").exists());
+    assert!(!place.path("run/checkpoints/.raygrad-tmp-123").exists());
+    assert!(!old.exists() && new.exists() && place.path("run/.tmp-notes").exists());
     // An unreadable checkpoint is not skipped: it may be valid.
     std::fs::create_dir(place.path("run/checkpoints/00000089.checkpoint")).unwrap();
     place.fails(
@@ -218,7 +228,7 @@ fn resume_needs_the_lock_and_the_training_images() {
     assert_eq!(place.json("run/config.json")["scene_box"]["near_far"][0], 2.5);
     // A folder without a finished file may become a run.
     std::fs::create_dir(place.path("begun")).unwrap();
-    std::fs::write(place.path("begun/.tmpx1"), b"{").unwrap();
+    std::fs::write(place.path("begun/.raygrad-tmp-x1"), b"{").unwrap();
     place.succeeds(&format!("train scene --steps 1 --out begun {SMALL}"));
     place.fails_with("train --resume absent", "absent: there is no such folder");
     for flag in ["scene --resume run", "--resume run --seed 3", "--resume run --set seed=3", "--resume run --out other"]
