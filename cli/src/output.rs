@@ -150,6 +150,12 @@ mod tests {
     use super::*;
 
     #[test]
+    fn printable_text_commands_no_terminal() {
+        assert_eq!(printable("a\tb\nä\u{1b}[2J\u{7}\u{9b}\r"), "a\tb\nä\\u{1b}[2J\\u{7}\\u{9b}\\r");
+        assert!(matches!(printable("plain"), Cow::Borrowed("plain")));
+    }
+
+    #[test]
     fn is_gone_for_closed_pipe_or_terminal_only() {
         let error = |number: i32| std::io::Error::from_raw_os_error(number);
         // A closed pipe, a closed terminal, a failing disk, and a full one.

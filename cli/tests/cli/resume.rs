@@ -89,8 +89,13 @@ fn interrupted_run_names_resume_and_can_be_extended() {
         assert!(said.contains("resumed  at step ") && !said.contains("resumed  at step 0\n"), "{said}");
     }
     assert_same(&place, "whole", "run");
-    // Resuming a finished run is not an error.
+    // Resuming a finished run is not an error. It names the program that resumed it.
+    let config = String::from_utf8(place.bytes("run/config.json")).unwrap();
+    let own = format!("\"raygrad\": \"{}\"", env!("CARGO_PKG_VERSION"));
+    assert!(config.contains(&own));
+    std::fs::write(place.path("run/config.json"), config.replace(&own, "\"raygrad\": \"0.0.1\"")).unwrap();
     place.succeeds("train --resume run");
+    assert_eq!(place.json("run/config.json")["raygrad"], env!("CARGO_PKG_VERSION"));
     assert_same(&place, "whole", "run");
     let kept = |place: &Place| place.json("run/config.json")["keep_checkpoints"].clone();
     assert_eq!(kept(&place), 2);
