@@ -297,8 +297,8 @@ pub(crate) fn any_powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
     }
     let power = x.powi(n - 1);
     // At 0 the quick product is right.
-    let is_other = x.abs();
-    let factors = [is_other.if_positive(power, one), is_other.if_positive(factor * power, one)];
+    let size = x.abs();
+    let factors = [size.if_positive(power, one), size.if_positive(factor * power, one)];
     checked!(
         s * (factor * power),
         s * factor,

@@ -149,6 +149,7 @@ The versions are {versions}.
 | in bold | reason |
 |---|---|
 | `exp` to `log2`, `erf`, `sin`, `cos`, `tanh`, `softplus` | [straight-line code](vector-math.md), one set of bits |
+| `log_sigmoid`, `elu` | a softplus, and an `expm1` times alpha |
 | gradients of `sin` and `cos` | these are values of `cos` and `sin`, times g |
 | `asin`, `atan2` | the platform's library, against SLEEF in PyTorch |
 | `cosh`, `hypot` | four roundings after an exponential, or a ratio |

@@ -162,19 +162,22 @@ impl Run {
         Ok(true)
     }
 
-    /// Removes temporary files of a killed program, and its folders from the day after on.
+    /// Removes temporary files of a killed training, and those of killed videos from the day after on.
     pub fn sweep(&self) {
         let folders = ["", "checkpoints", "previews", "tensorboard", "videos"].map(|name| self.file(name));
         let entries = folders.into_iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten().flatten();
-        let unfinished = entries.filter(is_unfinished).map(|entry| entry.path());
-        let (folders, files): (Vec<_>, Vec<_>) = unfinished.partition(|path| path.is_dir() && !path.is_symlink());
-        remove(&files);
-        // Another program may be writing a video.
-        let is_old = |folder: &PathBuf| {
-            let age = folder.metadata().and_then(|about| about.modified()).map(|time| time.elapsed());
+        let is_old = |path: &PathBuf| {
+            let age = path.symlink_metadata().and_then(|about| about.modified()).map(|time| time.elapsed());
             age.is_ok_and(|age| age.is_ok_and(|age| age > DAY))
         };
-        for folder in folders.into_iter().filter(is_old) {
+        // Another program may be making a video: folders, and what lies beside videos, stay for a day.
+        let videos = self.file("videos");
+        let is_folder = |path: &PathBuf| path.is_dir() && !path.is_symlink();
+        let is_swept = |path: &PathBuf| is_old(path) || !is_folder(path) && path.parent() != Some(&videos);
+        let unfinished = entries.filter(is_unfinished).map(|entry| entry.path()).filter(is_swept);
+        let (folders, files): (Vec<_>, Vec<_>) = unfinished.partition(is_folder);
+        remove(&files);
+        for folder in folders {
             if let Err(e) = std::fs::remove_dir_all(&folder) {
                 complain(&format!("{}: cannot be removed: {e}", folder.display()));
             }

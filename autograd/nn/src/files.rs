@@ -16,7 +16,8 @@ pub const TEMPORARY_PREFIX: &str = ".raygrad-tmp-";
 /// one. After a loss of power the file has the old or the new bytes.
 ///
 /// # Errors
-/// If the folder does not exist or the file cannot be written.
+/// If the folder does not exist or the file cannot be written; or if the folder cannot be flushed, when the file has its
+/// new bytes.
 pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     let path = path.as_ref();
     let folder = parent(path);
@@ -38,7 +39,8 @@ pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
 /// flushes the contents, renames, and flushes the folders of both paths.
 ///
 /// # Errors
-/// If the contents cannot be flushed or the rename fails, when nothing is renamed; or if a folder cannot be flushed.
+/// If the contents cannot be flushed or the rename fails, when nothing is renamed; or if a folder cannot be flushed, when
+/// it is renamed.
 pub fn rename_durable(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> {
     let (from, to) = (from.as_ref(), to.as_ref());
     sync_all(from)?;
@@ -51,7 +53,7 @@ pub fn rename_durable(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()
 /// Creates a folder with its parents, and flushes the folders that have gained one.
 ///
 /// # Errors
-/// If a folder cannot be created.
+/// If a folder cannot be created or flushed.
 pub fn create_folder(folder: impl AsRef<Path>) -> Result<()> {
     let folder = folder.as_ref();
     let new: Vec<&Path> =

@@ -81,6 +81,9 @@ impl Workplace {
         let done = temporary.keep();
         let moved = if is_inside { move_up(&done, &out) } else { raygrad::nn::rename_durable(&done, &out) };
         moved.map_err(|e| {
+            if !done.exists() {
+                return Error::file(&out, format!("is complete, but may not outlast a loss of power: {e}"));
+            }
             let done = done.display();
             Error::file(&out, format!("cannot be written: {e}; the result is complete: move it from {done}"))
         })

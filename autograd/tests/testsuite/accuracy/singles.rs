@@ -2,7 +2,7 @@
 //! An error close to the limit is measured again, against the reference.
 //!
 //! In the suite these are some thousand cases an operation. All 2^32 arguments of the functions of one operand, with random
-//! incoming gradients, take about an hour on two cores:
+//! incoming gradients, take about four minutes a function on two cores:
 //!
 //! ```sh
 //! ACCURACY_SINGLES=4294967296 ACCURACY_OPERANDS=1 cargo test --release -p raygrad-autograd --test testsuite singles -- --nocapture
