@@ -12,6 +12,7 @@ use tokio::sync::Semaphore;
 use tokio::time::{timeout, timeout_at};
 
 use super::messages::{ClientMessage, File};
+use super::networks::Network;
 use super::requests::{Outbox, Outgoing, sorry};
 use super::served::{Limits, Served};
 
@@ -38,9 +39,9 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// Creates the connection if there are fewer pages than the limit.
-    pub fn join(served: Arc<Served>) -> Option<Self> {
-        let (client, outbox) = served.requests.join(served.limits.pages)?;
+    /// Creates the connection, unless there are too many pages and its network has its share of them.
+    pub fn join(served: Arc<Served>, network: Network) -> Option<Self> {
+        let (client, outbox) = served.requests.join(network, served.limits.pages)?;
         Some(Connection {
             client,
             outbox,
@@ -81,8 +82,8 @@ impl Connection {
                     return None;
                 }
             }
-            if outbox.is_overrun() {
-                return Some("too many unsent replies");
+            if let Some(reason) = outbox.closing() {
+                return Some(reason);
             }
             let seen = outbox.flying().map(|(since, bytes)| since + limits.patience_for(bytes));
             if seen.is_some_and(|until| until <= Instant::now()) {
@@ -231,17 +232,17 @@ mod tests {
         let video_jobs = video_jobs(&requests);
         let (readers, limits) = (Semaphore::new(1), Limits::USUAL);
         let (background, host) = ([1.0; 3], String::new());
-        Connection::join(Arc::new(Served {
+        let served = Arc::new(Served {
             requests,
             photos: None,
             video_jobs,
             background,
             host,
-            token: None,
+            token: String::new(),
             readers,
             limits,
-        }))
-        .unwrap()
+        });
+        Connection::join(served, Network::LOCAL).unwrap()
     }
 
     fn view() -> View {

@@ -3,8 +3,10 @@
 mod access;
 mod cache;
 mod connection;
+mod forward;
 pub mod messages;
 mod model_cache;
+mod networks;
 mod photo_cache;
 mod renderer;
 mod requests;
@@ -26,6 +28,7 @@ use super::checkpoint;
 use super::output::{complain, note, print};
 use super::run::Run;
 use super::scene::Scene;
+use forward::ForwardPage;
 use messages::{About, FirstView, ServerMessage, Taken, rows};
 use model_cache::ModelCache;
 use photo_cache::PhotoCache;
@@ -68,7 +71,7 @@ pub struct Args {
 pub struct PlaceArgs {
     /// Address to serve on
     ///
-    /// 127.0.0.1 serves this machine only. With any other address, the link gives access, since it holds a token.
+    /// 127.0.0.1 serves this machine only. The link holds a token and gives access to everyone who has it.
     /// The connection is not encrypted.
     #[arg(long, help_heading = "Viewer", default_value = HOST)]
     host: String,
@@ -103,14 +106,17 @@ pub fn run(args: &Args) -> Result<()> {
     let background = model.config.background.shown();
     let link = server::serve(args.place.listen()?, requests.clone(), photos.clone(), Some(video_jobs), background)?;
     print(&format!("view     {link}\n         Ctrl-C ends the viewer\n"))?;
-    if args.open
-        && let Err(error) = open::that_detached(&link)
-    {
-        complain(&format!("warning: cannot open a browser: {error}"));
-    }
+    let mut forward = args.open.then(|| ForwardPage::open(&run.folder, &link)).and_then(|opened| match opened {
+        Ok(page) => Some(page),
+        Err(error) => {
+            complain(&format!("warning: cannot open a browser: {error}"));
+            None
+        }
+    });
     let mut renderer = Renderer::new(requests.clone(), photos, Some(ModelCache::new(run, model.clone())));
     loop {
         renderer.work_or_wait(&model, 0, Duration::from_secs(1));
+        forward.take_if(|page| requests.connected() > 0 || page.is_old());
     }
 }
 

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::Notify;
 
 use super::messages::{self, File, Made, ServerMessage, View};
+use super::networks::{Network, largest};
 
 /// Most messages that wait for a page. Well-behaved pages stay far below.
 const WAITING: usize = 64;
@@ -43,7 +44,8 @@ struct Waiting {
     told: Option<String>,
     /// The render that was sent but not acknowledged.
     flying: Option<InFlight>,
-    overrun: bool,
+    /// Reason for closing the connection.
+    closing: Option<&'static str>,
 }
 
 struct InFlight {
@@ -77,8 +79,10 @@ impl Outbox {
     /// Appends a message.
     pub fn post(&self, message: Outgoing) {
         let mut waiting = self.lock();
-        waiting.overrun |= waiting.others.len() >= WAITING;
-        if !waiting.overrun {
+        if waiting.others.len() >= WAITING {
+            waiting.closing.get_or_insert("too many unsent replies");
+        }
+        if waiting.closing.is_none() {
             waiting.others.push_back(message);
         }
         drop(waiting);
@@ -129,9 +133,15 @@ impl Outbox {
         self.changed.notify_one();
     }
 
-    /// Returns true if too many messages wait for the page.
-    pub fn is_overrun(&self) -> bool {
-        self.lock().overrun
+    /// Reason for closing the connection, if there is one.
+    pub fn closing(&self) -> Option<&'static str> {
+        self.lock().closing
+    }
+
+    /// Closes the connection.
+    fn close(&self, reason: &'static str) {
+        self.lock().closing = Some(reason);
+        self.changed.notify_one();
     }
 
     /// Acknowledges a render.
@@ -142,6 +152,7 @@ impl Outbox {
 }
 
 struct Client {
+    network: Network,
     wish: Option<(u32, Arc<RenderRequest>)>,
     outbox: Arc<Outbox>,
 }
@@ -190,24 +201,33 @@ impl Requests {
         self.lock().about.clone()
     }
 
-    /// Adds a page if there are fewer than `most`.
-    pub fn join(&self, most: usize) -> Option<(u64, Arc<Outbox>)> {
+    /// Adds a page. If there are `most` already, it replaces the newest page of the network with the most pages, unless
+    /// that is its own.
+    pub fn join(&self, network: Network, most: usize) -> Option<(u64, Arc<Outbox>)> {
         let mut state = self.lock();
         if state.clients.len() >= most {
-            return None;
+            let crowd = largest(state.clients.values().map(|client| client.network), network);
+            let newest = state.clients.iter().rfind(|(_, client)| client.network == crowd && crowd != network);
+            let newest = *newest?.0;
+            if let Some(client) = self.remove(&mut state, newest) {
+                client.outbox.close("too many viewer pages are open at your address");
+            }
         }
         let (number, outbox) = (state.next, Arc::new(Outbox::default()));
         state.next += 1;
-        state.clients.insert(number, Client { wish: None, outbox: outbox.clone() });
+        state.clients.insert(number, Client { network, wish: None, outbox: outbox.clone() });
         Some((number, outbox))
     }
 
     /// Removes a page.
     pub fn leave(&self, client: u64) {
-        let mut state = self.lock();
-        state.clients.remove(&client);
+        self.remove(&mut self.lock(), client);
+    }
+
+    fn remove(&self, state: &mut State, client: u64) -> Option<Client> {
         state.saves.retain(|save| save.client != client);
-        self.news(&mut state);
+        self.news(state);
+        state.clients.remove(&client)
     }
 
     /// Number of connected pages.

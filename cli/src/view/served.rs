@@ -12,7 +12,7 @@ use super::video_jobs::VideoJobs;
 /// Resource limits and time-outs of pages and connections.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// Most pages, and most connections before they become pages.
+    /// Most pages, and most connections before they become pages. Beyond, the network with the most gives one up.
     pub pages: usize,
     pub connections: usize,
     /// Time-out of a connection that does not become a page.
@@ -70,8 +70,8 @@ pub struct Served {
     pub background: [f32; 3],
     /// The host name that pages may use besides IP addresses.
     pub host: String,
-    /// Token that links need if other machines can connect.
-    pub token: Option<String>,
+    /// Token of the link, which gives access.
+    pub token: String,
     /// Limits the number of images that are read at a time.
     pub readers: Semaphore,
     pub limits: Limits,

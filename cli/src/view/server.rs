@@ -7,7 +7,7 @@ use std::time::Duration;
 use axum::Router;
 use axum::body::Body;
 use axum::extract::ws::WebSocketUpgrade;
-use axum::extract::{Query, State};
+use axum::extract::{Extension, Query, State};
 use axum::http::header::{self, HeaderMap};
 use axum::http::{Method, StatusCode, Uri};
 use axum::middleware;
@@ -15,12 +15,13 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
-use raygrad::nerf::{Error, Result};
+use raygrad::nerf::Error;
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
 use super::access::{AccessToken, check_access};
 use super::connection::Connection;
+use super::networks::{Connections, Network};
 use super::photo_cache::PhotoCache;
 use super::requests::Requests;
 use super::served::{Limits, Served};
@@ -52,7 +53,7 @@ impl Listener {
     /// # Errors
     ///
     /// Fails if the host is unknown or the port is in use.
-    pub fn bind(host: &str, port: u16) -> Result<Self> {
+    pub fn bind(host: &str, port: u16) -> raygrad::nerf::Result<Self> {
         let bad = |e: std::io::Error| Error::setting("host", format!("{host}:{port} cannot be used: {e}"));
         let listener = TcpListener::bind((host, port)).map_err(bad)?;
         listener.set_nonblocking(true).map_err(bad)?;
@@ -60,7 +61,7 @@ impl Listener {
     }
 }
 
-/// Starts the server threads and returns the link.
+/// Starts the server threads and returns the link, whose token gives access.
 ///
 /// # Errors
 ///
@@ -71,7 +72,7 @@ pub fn serve(
     photos: Option<Arc<PhotoCache>>,
     video_jobs: Option<Arc<VideoJobs>>,
     background: [f32; 3],
-) -> Result<String> {
+) -> raygrad::nerf::Result<String> {
     serve_within(Limits::USUAL, listener, requests, photos, video_jobs, background)
 }
 
@@ -82,10 +83,10 @@ fn serve_within(
     photos: Option<Arc<PhotoCache>>,
     video_jobs: Option<Arc<VideoJobs>>,
     background: [f32; 3],
-) -> Result<String> {
+) -> raygrad::nerf::Result<String> {
     let bad = |e: std::io::Error| Error::setting("host", format!("{address} cannot be served: {e}"));
-    let token = (!address.ip().is_loopback()).then(|| format!("{:032x}", rand::random::<u128>()));
-    let link = link(address, &host, outward(address.ip(), beyond(address.ip())), token.as_deref());
+    let token = format!("{:032x}", rand::random::<u128>());
+    let link = link(address, &host, outward(address.ip(), beyond(address.ip())), &token);
     let served = Served { requests, photos, video_jobs, background, host, token, readers: Semaphore::new(2), limits };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(bad)?;
     let run = move || {
@@ -101,15 +102,15 @@ fn serve_within(
 }
 
 /// The link to an address. It uses the requested host, or the outward address if the server listens on all addresses.
-fn link(address: SocketAddr, host: &str, outward: Option<IpAddr>, token: Option<&str>) -> String {
+/// Browsers send no fragment, so the token reaches neither a proxy nor a log.
+fn link(address: SocketAddr, host: &str, outward: Option<IpAddr>, token: &str) -> String {
     let host = match address.ip() {
         ip if ip.is_loopback() => ip.to_string(),
         ip if ip.is_unspecified() => outward.unwrap_or(ip).to_string(),
         _ => host.to_owned(),
     };
     let host = if host.contains(':') { format!("[{host}]") } else { host };
-    let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
-    format!("http://{host}:{}/{token}", address.port())
+    format!("http://{host}:{}/#token={token}", address.port())
 }
 
 /// The local address of outgoing connections to another address. Sends nothing.
@@ -125,60 +126,74 @@ fn beyond(own: IpAddr) -> &'static str {
 }
 
 async fn accept(listener: tokio::net::TcpListener, router: Router, limits: Limits) {
-    let permits = Arc::new(Semaphore::new(limits.connections));
+    let mut connections = Connections::new(limits.connections);
     loop {
-        let Ok(permit) = permits.clone().acquire_owned().await else { return };
-        let Ok((stream, _)) = listener.accept().await else {
+        let Ok((stream, address)) = listener.accept().await else {
             // For example, too many files are open.
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
         let _ = stream.set_nodelay(true);
-        let service = TowerToHyperService::new(router.clone());
-        tokio::spawn(async move {
+        let network = Network::of(address.ip());
+        let service = TowerToHyperService::new(router.clone().layer(Extension(network)));
+        connections.spawn(network, async move {
             let mut http = hyper::server::conn::http1::Builder::new();
             http.timer(TokioTimer::new()).header_read_timeout(limits.patience).max_buf_size(HEAD);
             // Errors of a connection need no handling. After an upgrade, the page's own task handles the connection.
             let served = http.serve_connection(TokioIo::new(stream), service).with_upgrades();
             let _ = timeout(limits.connected, served).await;
-            drop(permit);
         });
+        // A flood of connections leaves time to serve each of them.
+        tokio::task::yield_now().await;
     }
 }
 
 fn router(served: Arc<Served>) -> Router {
     let guarded = middleware::from_fn_with_state(served.clone(), check_access);
-    Router::new().route("/messages", get(messages)).fallback(file).layer(guarded).with_state(served)
+    Router::new()
+        .route("/access", get(access))
+        .route("/messages", get(messages))
+        .fallback(file)
+        .layer(guarded)
+        .with_state(served)
 }
 
-async fn file(method: Method, uri: Uri, State(served): State<Arc<Served>>, query: Query<AccessToken>) -> Response {
-    let Some((path, kind, text)) = FILES.iter().find(|(path, _, _)| *path == uri.path()) else {
+/// The page's files, which are the same for every scene.
+async fn file(method: Method, uri: Uri) -> Response {
+    let Some((_, kind, text)) = FILES.iter().find(|(path, _, _)| *path == uri.path()) else {
         return (StatusCode::NOT_FOUND, "No such page.\n").into_response();
     };
     if method != Method::GET && method != Method::HEAD {
         return (StatusCode::METHOD_NOT_ALLOWED, [(header::ALLOW, "GET, HEAD")]).into_response();
     }
-    // Style sheet and scripts need no token.
-    if *path == "/" && !query.opens(served.token.as_deref()) {
-        return (StatusCode::FORBIDDEN, "The token is missing or wrong. Open the link that raygrad printed.\n")
-            .into_response();
-    }
     ([(header::CONTENT_TYPE, *kind)], Body::from(*text)).into_response()
+}
+
+/// Says whether a token is right: browsers do not tell pages why a WebSocket was refused.
+async fn access(State(served): State<Arc<Served>>, query: Query<AccessToken>) -> Response {
+    if !query.opens(&served.token) { forbidden() } else { StatusCode::NO_CONTENT.into_response() }
+}
+
+fn forbidden() -> Response {
+    (StatusCode::FORBIDDEN, "The token is missing or wrong. Open the link that raygrad printed.\n").into_response()
 }
 
 async fn messages(
     State(served): State<Arc<Served>>,
     query: Query<AccessToken>,
+    Extension(network): Extension<Network>,
     headers: HeaderMap,
     upgrade: WebSocketUpgrade,
 ) -> Response {
+    if !query.opens(&served.token) {
+        return forbidden();
+    }
     // Browsers always send the origin of a WebSocket request.
-    let origin = headers.get(header::ORIGIN).is_some();
-    if !query.opens(served.token.as_deref()) || !origin {
+    if headers.get(header::ORIGIN).is_none() {
         return (StatusCode::FORBIDDEN, "Only the viewer page may connect.\n").into_response();
     }
     let longest = served.limits.longest;
-    let Some(page) = Connection::join(served) else {
+    let Some(page) = Connection::join(served, network) else {
         return (StatusCode::SERVICE_UNAVAILABLE, "Too many viewer pages are open. Close one.\n").into_response();
     };
     let upgrade = upgrade.max_message_size(longest).max_frame_size(longest);

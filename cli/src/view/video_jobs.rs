@@ -266,7 +266,7 @@ mod tests {
         impl Place {
             fn new() -> Self {
                 let (folder, requests) = (tempfile::tempdir().unwrap(), Arc::new(Requests::default()));
-                let outbox = requests.join(1).unwrap().1;
+                let outbox = requests.join(crate::view::networks::Network::LOCAL, 1).unwrap().1;
                 let run = Arc::new(Run { folder: folder.path().to_owned(), config: run_config() });
                 Place { folder, video_jobs: Arc::new(VideoJobs::new(run, None, requests)), outbox }
             }

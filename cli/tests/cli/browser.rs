@@ -185,8 +185,8 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
         browser.value(&format!("JSON.stringify(keys) !== '[]' && size(sub(keys[1].eye, {path}.eye)) + size(sub(keys[1].back, {path}.back)) < 1e-9"))
     };
     let last = browser.value("window.before = true, JSON.stringify(keys[1])");
-    browser.visit(server);
-    assert_eq!(browser.value("typeof before"), "undefined");
+    browser.reload();
+    assert_eq!(browser.value("typeof before + location.hash"), "undefined");
     assert_eq!(there(&mut browser, last.as_str().unwrap()), true);
     browser.value("keys = [], listKeys()");
     let file = json!(std::fs::read_to_string(place.path("path.json")).unwrap());
@@ -416,7 +416,11 @@ fn browser_reconnects_and_fits_a_phone() {
     drop(server);
     browser.until("!document.getElementById('lost').hidden");
     browser.shot("lost");
+    // The new server has another token, and the old tab keeps its camera.
     let server = serve(&place, &format!("view run --port {port}"));
+    browser.until("document.getElementById('lost').textContent.startsWith('This link does not open the viewer')");
+    browser.shot("refused");
+    browser.go(&server.link());
     browser.until("document.getElementById('lost').hidden");
     browser.rested();
     assert_eq!(browser.value("JSON.stringify(view.eye)"), pose, "where it was");
@@ -464,7 +468,7 @@ fn browser_shows_and_controls_training() {
     let Some(mut browser) = Browser::open(Kind::Chromium) else { return };
     let place = Place::with_scene();
     let mut server = serve(&place, &format!("--threads 1 train scene --steps 1000000 --view --out run {SMALL}"));
-    browser.go(&format!("http://{}/", server.address));
+    browser.go(&server.link());
     // On a busy machine no complete image arrives before training is paused.
     browser.until("typeof training !== 'undefined' && training !== null && training.step > 20 && shown !== null");
     browser.until("shown.step > 10");

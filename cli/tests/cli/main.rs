@@ -12,6 +12,8 @@ use raygrad_scenes::embedded;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
+#[cfg(target_os = "linux")]
+mod attack;
 #[cfg(unix)]
 mod browser;
 mod captures;

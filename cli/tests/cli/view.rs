@@ -22,7 +22,17 @@ use tungstenite::{Message, WebSocket};
 /// A program that serves a page; it ends when this is dropped.
 pub struct Server {
     pub child: Child,
+    /// Host and port.
     pub address: String,
+    /// Token of its link.
+    pub token: String,
+}
+
+impl Server {
+    /// The printed link.
+    pub fn link(&self) -> String {
+        format!("http://{}/#token={}", self.address, self.token)
+    }
 }
 
 impl Drop for Server {
@@ -47,8 +57,8 @@ fn serve_with(command: &mut Command) -> Server {
     }
     // Drains the rest of its output.
     std::thread::spawn(move || std::io::copy(&mut out, &mut std::io::sink()));
-    let address = line.split("http://").nth(1).unwrap().trim().trim_end_matches('/').to_owned();
-    Server { child, address }
+    let (address, token) = line.split("http://").nth(1).unwrap().trim().split_once("/#token=").unwrap();
+    Server { child, address: address.to_owned(), token: token.to_owned() }
 }
 
 /// Sends a plain request and returns status, head and body.
@@ -63,8 +73,8 @@ fn request(address: &str, head: &str) -> (u16, String, String) {
 }
 
 /// A client without a browser.
-struct Page {
-    socket: WebSocket<MaybeTlsStream<TcpStream>>,
+pub struct Page {
+    pub socket: WebSocket<MaybeTlsStream<TcpStream>>,
     /// Received messages that were not used yet.
     texts: VecDeque<Value>,
     files: VecDeque<(Value, Vec<u8>)>,
@@ -73,8 +83,8 @@ struct Page {
 }
 
 impl Page {
-    fn open(address: &str) -> (Self, Value) {
-        let request = Request::builder().uri(format!("ws://{address}/messages"));
+    pub fn open(Server { address, token, .. }: &Server) -> (Self, Value) {
+        let request = Request::builder().uri(format!("ws://{address}/messages?token={token}"));
         let request = request.header("Host", address).header("Origin", format!("http://{address}"));
         let request = request.header("Connection", "Upgrade").header("Upgrade", "websocket");
         let request = request.header("Sec-WebSocket-Version", "13").header("Sec-WebSocket-Key", generate_key());
@@ -87,7 +97,7 @@ impl Page {
         (page, about)
     }
 
-    fn say(&mut self, message: Value) {
+    pub fn say(&mut self, message: Value) {
         self.said = Instant::now();
         self.socket.send(Message::text(message.to_string())).unwrap();
     }
@@ -158,7 +168,7 @@ impl Page {
         }
     }
 
-    fn file(&mut self, kind: &str) -> (Value, Vec<u8>) {
+    pub fn file(&mut self, kind: &str) -> (Value, Vec<u8>) {
         loop {
             while let Some(file) = self.files.pop_front() {
                 if file.0["file"] == kind {
@@ -187,7 +197,7 @@ impl Page {
 
     /// The reason why the program closes the connection, which it must.
     #[track_caller]
-    fn closed(&mut self) -> String {
+    pub fn closed(&mut self) -> String {
         let start = Instant::now();
         loop {
             assert!(start.elapsed() < Duration::from_secs(60), "the connection is still open");
@@ -213,13 +223,13 @@ fn decoded(bytes: &[u8]) -> Image {
 /// The cameras of a run's test views as pages receive them.
 pub fn test_cameras(place: &Place, run: &str) -> Vec<Value> {
     let server = serve(place, &format!("view {run}"));
-    let about = Page::open(&server.address).1;
+    let about = Page::open(&server).1;
     let photographs = about["photographs"].as_array().unwrap();
     photographs.iter().filter(|photograph| photograph["split"] == "test").cloned().collect()
 }
 
 /// A place with a run that renders quickly.
-fn trained() -> Place {
+pub fn trained() -> Place {
     static TRAINED: LazyLock<Kept> = LazyLock::new(|| {
         let place = Place::with_scene();
         place.succeeds(&format!("train scene --steps 60 --out run {SMALL}"));
@@ -229,7 +239,7 @@ fn trained() -> Place {
 }
 
 /// The initial view of the scene.
-fn first(about: &Value, size: [usize; 2]) -> Value {
+pub fn first(about: &Value, size: [usize; 2]) -> Value {
     json!({ "eye": { "free": { "pose": about["pose"], "fov": about["fov"] } }, "size": size })
 }
 
@@ -239,7 +249,7 @@ fn page_image_equals_render() {
     place.succeeds("render run --frames 1 --size 96x96 --out seen");
     let expected = png(&place.path("seen/0000.png"));
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     assert_eq!(json!([about["title"], about["training"], about["size"]]), json!(["run", false, [SIZE, SIZE]]));
     let names: Vec<_> = about["photographs"].as_array().unwrap().iter().map(|p| p["name"].clone()).collect();
     assert_eq!(names.len(), 11);
@@ -257,7 +267,7 @@ fn page_image_equals_render() {
         assert_eq!(pair[0].1.width, pair[1].1.width.div_ceil(2));
     }
     // Another client gets the rendered image at once.
-    let (mut other, _) = Page::open(&server.address);
+    let (mut other, _) = Page::open(&server);
     assert_eq!(other.look(1, &view)[0].1, *whole);
     let shows = ["depth", "normals", "opacity"].map(|show| {
         place.succeeds(&format!("render run --frames 1 --size 96x96 --show {show} --out {show}"));
@@ -299,7 +309,7 @@ fn page_image_equals_render() {
 fn image_is_rendered_once_and_none_for_hidden_pages() {
     let place = Place::with_scene();
     let server = serve(&place, &format!("--threads 1 train scene --steps 1000000 --view --out run {SMALL}"));
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     // During training the view is rendered again, but not at a slow resolution.
     page.say(json!({ "ask": "view", "id": 1, "view": first(&about, [900, 900]) }));
     let shots: Vec<Value> = (0..4).map(|_| page.file("picture").0).collect();
@@ -349,7 +359,7 @@ fn captures_keep_proportions_and_positions() {
     std::fs::write(place.path("around/transforms.json"), transforms.to_string()).unwrap();
     place.succeeds(&format!("train around --steps 30 --out run {SMALL}"));
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     assert_eq!(json!([about["size"], about["photographs"][0]["size"]]), json!([[32, 24], [32, 24]]));
     assert!((about["proportion"].as_f64().unwrap() - 4.0 / 3.0).abs() < 1e-9);
     // In capture coordinates the point has its original position.
@@ -389,7 +399,7 @@ fn built_in_images_are_distinct() {
     let place = Place::empty();
     place.succeeds(&format!("train embedded --downscale 20 --steps 1 --out run {SMALL}"));
     let server = serve(&place, "view run");
-    let (mut page, _) = Page::open(&server.address);
+    let (mut page, _) = Page::open(&server);
     let photographs = [0, 3].map(|number| {
         page.say(json!({ "ask": "photograph", "number": number }));
         page.file("photograph").1
@@ -403,7 +413,7 @@ fn images_are_compared_from_their_cameras() {
     place.succeeds("eval run --split val");
     let scores = place.json("run/eval-val-fast.json");
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     let view = json!({ "eye": { "photograph": 7 }, "size": [SIZE, SIZE], "compared": true });
     let (head, _) = page.look(1, &view).pop().unwrap();
     let errors =
@@ -455,7 +465,7 @@ fn images_are_compared_from_their_cameras() {
     place.succeeds(&format!("train captured --scene-type bounded --background black --steps 150 --out black {SMALL}"));
     place.succeeds("eval black");
     let server = serve(&place, "view black");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     let tests = |about: &Value| -> Vec<usize> {
         let photographs = about["photographs"].as_array().unwrap().iter().enumerate();
         photographs.filter(|(_, photograph)| photograph["split"] == "test").map(|(i, _)| i).collect()
@@ -479,12 +489,12 @@ fn images_are_compared_from_their_cameras() {
     assert!(seen.data[0] < 0.2 && photograph.data[0] < 0.2, "{} {}", seen.data[0], photograph.data[0]);
     // Without images, or with other ones, the rest works.
     let server = serve(&place, "view run --scene captured");
-    assert_eq!(Page::open(&server.address).1["photographs"], json!([]));
+    assert_eq!(Page::open(&server).1["photographs"], json!([]));
     std::fs::rename(place.path("scene"), place.path("gone")).unwrap();
     let server = serve(&place, "view run --scene gone");
-    assert_eq!(Page::open(&server.address).1["photographs"].as_array().unwrap().len(), 11);
+    assert_eq!(Page::open(&server).1["photographs"].as_array().unwrap().len(), 11);
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     assert_eq!(about["photographs"], json!([]));
     for (id, view) in [(1, &view), (2, &json!({ "eye": { "photograph": 0 }, "size": [8, 8] }))] {
         page.say(json!({ "ask": "view", "id": id, "view": view }));
@@ -502,7 +512,7 @@ fn images_with_embeddings_have_no_psnr() {
     place.succeeds("eval run");
     let scores = place.json("run/eval-test-fast.json");
     let server = serve(&place, "view run");
-    let (mut page, _) = Page::open(&server.address);
+    let (mut page, _) = Page::open(&server);
     let mut compared = |number: usize| {
         let view = json!({ "eye": { "photograph": number }, "size": [SIZE, SIZE], "compared": true });
         page.look(number as u32, &view).pop().unwrap().0["compared"].clone()
@@ -533,7 +543,27 @@ fn view_opens_the_browser() {
         while !opened().ends_with('\n') && start.elapsed() < patience {
             std::thread::sleep(Duration::from_millis(20));
         }
-        assert_eq!(opened(), if opens { format!("http://{}/\n", server.address) } else { String::new() });
+        let opened = opened();
+        if !opens {
+            assert_eq!(opened, "");
+            continue;
+        }
+        // The browser gets a page that forwards, and not the token.
+        let page = std::path::Path::new(opened.trim());
+        assert!(
+            !opened.contains(&server.token) && page.starts_with(place.path("run").canonicalize().unwrap()),
+            "{opened}"
+        );
+        let text = std::fs::read_to_string(page).unwrap();
+        assert!(text.contains(&format!("url={}\"", server.link())), "{text}");
+        assert_eq!(std::fs::metadata(page).unwrap().permissions().mode() & 0o777, 0o600);
+        // It is removed when a page has connected.
+        let (_page, _) = Page::open(&server);
+        let start = Instant::now();
+        while page.exists() {
+            assert!(start.elapsed() < Duration::from_secs(30), "{opened}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
     }
 }
 
@@ -554,18 +584,19 @@ fn viewer_refuses_others_without_the_token() {
     assert!(!place.path("other").exists(), "nothing is begun");
     place.fails_with("view absent", "absent: there is no such folder");
     let server = serve(&place, "view run --host 0.0.0.0");
-    let (host, token) = server.address.split_once("/?token=").unwrap();
-    let address = format!("127.0.0.1:{}", host.rsplit(':').next().unwrap());
+    let port = server.address.rsplit(':').next().unwrap().to_owned();
+    let address = format!("127.0.0.1:{port}");
     let status = |path: &str| request(&address, &format!("GET {path} HTTP/1.1\r\nHost: {address}")).0;
-    assert_eq!([status(&format!("/?token={token}")), status("/")], [200, 403]);
+    // The page holds no data; its messages need the token.
+    assert_eq!([status("/"), status("/access"), status(&format!("/access?token={}", server.token))], [200, 403, 204]);
 }
 
 #[test]
 fn malformed_message_closes_its_connection() {
     let place = trained();
     let server = serve(&place, "view run");
-    let (mut good, about) = Page::open(&server.address);
-    let (mut page, _) = Page::open(&server.address);
+    let (mut good, about) = Page::open(&server);
+    let (mut page, _) = Page::open(&server);
     page.say(json!({ "ask": "view", "id": 1, "view": first(&about, [4096, 4096]) }));
     assert!(page.closed().contains("4096x4096 is not a size"));
     // An error names an unknown image, and the other page is still served.
@@ -578,7 +609,7 @@ fn malformed_message_closes_its_connection() {
 fn newest_camera_replaces_older_requests() {
     let place = trained();
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     let mut view = first(&about, [300, 300]);
     // All but the last of many views are hardly rendered.
     for id in 1..=100 {
@@ -604,7 +635,7 @@ fn training_viewer_pauses_and_stops_same_model() {
     let said = std::fs::File::create(place.path("said")).unwrap();
     let mut command = place.command(&format!("train scene --steps 300 --view --out run {SMALL}"));
     let mut server = serve_with(command.stderr(said));
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     assert_eq!(about["training"], true);
     page.say(json!({ "ask": "pause", "pause": true }));
     while page.text("training")["paused"] != true {}
@@ -616,7 +647,7 @@ fn training_viewer_pauses_and_stops_same_model() {
     // A page that reconnects soon finds the training as it was.
     drop(page);
     std::thread::sleep(Duration::from_millis(600));
-    let (mut page, _) = Page::open(&server.address);
+    let (mut page, _) = Page::open(&server);
     let told = page.text("training");
     assert_eq!(json!([told["paused"], told["step"]]), json!([true, held]));
     page.say(json!({ "ask": "view", "id": 2, "view": view }));
@@ -651,7 +682,7 @@ fn training_viewer_pauses_and_stops_same_model() {
 
     // A run stopped from the page can be resumed.
     let mut server = serve(&place, &format!("train scene --steps 300 --view --out other {SMALL}"));
-    let (mut page, _) = Page::open(&server.address);
+    let (mut page, _) = Page::open(&server);
     page.say(json!({ "ask": "pause", "pause": true }));
     while page.text("training")["paused"] != true {}
     page.say(json!({ "ask": "stop" }));
@@ -671,7 +702,7 @@ fn viewer_checkpoints_and_skips_equal_render() {
     place.succeeds(&format!("{train} --keep-checkpoints 500 --out run"));
     assert_eq!(place.command("train scene --keep-checkpoints 1").output().unwrap().status.code(), Some(2));
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     let steps: Vec<u64> = about["checkpoints"].as_array().unwrap().iter().map(|step| step.as_u64().unwrap()).collect();
     assert!(steps.len() > 4 && steps.is_sorted() && [steps[0], steps[steps.len() - 1]] == [0, 150], "{steps:?}");
     let view = first(&about, [64, 64]);
@@ -698,7 +729,7 @@ fn viewer_checkpoints_and_skips_equal_render() {
     place.succeeds(&format!("train --resume other --steps {earlier}"));
     place.succeeds("render other --frames 1 --size 64x64 --out earlier");
     // On a busy machine this takes so long that the server drops the silent page.
-    let (mut page, _) = Page::open(&server.address);
+    let (mut page, _) = Page::open(&server);
     let at_earlier = with("checkpoint", json!(earlier));
     assert_eq!(page.look(2, &at_earlier).pop().unwrap().0["step"], earlier);
     let before = kept(&mut page, &at_earlier);
@@ -773,7 +804,7 @@ fn path(about: &Value, seconds: f64) -> Value {
 fn videos_are_made_one_at_a_time_beside_views() {
     let place = trained();
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     let ended = |page: &mut Page| loop {
         let told = page.text("video");
         if told["ended"] == true {
@@ -841,11 +872,11 @@ fn videos_are_made_one_at_a_time_beside_views() {
     std::thread::sleep(Duration::from_millis(400));
     assert_eq!(count(), then);
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     page.say(json!({ "ask": "end-video" }));
     page.look(2, &first(&about, [17, 16]));
     let server = serve(&place, &format!("--threads 1 train scene --steps 1000000 --view --out other {SMALL}"));
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     page.say(json!({ "ask": "video", "path": path(&about, 1.0) }));
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("only after training"));
     assert!(!place.path("other/videos").exists());
@@ -856,7 +887,7 @@ fn viewer_knows_refined_cameras() {
     let place = Place::with_scene();
     let server =
         serve(&place, &format!("--threads 1 train scene --steps 1000000 --refine poses --view --out run {SMALL}"));
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     let taken = page.text("taken");
     let poses =
         |told: &Value| told["photographs"].as_array().unwrap().iter().map(|p| p["pose"].clone()).collect::<Vec<_>>();
@@ -873,7 +904,7 @@ fn viewer_knows_refined_cameras() {
         assert_eq!(nearest.unwrap().0, i);
     }
     // A page that connects later gets the current cameras.
-    let (_, later) = Page::open(&server.address);
+    let (_, later) = Page::open(&server);
     assert_ne!(poses(&later), poses(&about));
 }
 
@@ -881,7 +912,7 @@ fn viewer_knows_refined_cameras() {
 fn idle_page_uses_no_cpu_time() {
     let place = trained();
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     page.look(1, &first(&about, [32, 32]));
     // In hundredths of a second, if the system reports it.
     let taken = || -> Option<u64> {
@@ -901,7 +932,7 @@ fn idle_page_uses_no_cpu_time() {
 fn unreadable_images_are_named() {
     let place = trained();
     let server = serve(&place, "view run");
-    let (mut page, about) = Page::open(&server.address);
+    let (mut page, about) = Page::open(&server);
     std::fs::write(place.path("scene/train/r_3.png"), b"nothing").unwrap();
     let view = json!({ "eye": { "photograph": 3 }, "size": [16, 16], "compared": true });
     page.say(json!({ "ask": "view", "id": 1, "view": view }));
@@ -934,7 +965,7 @@ fn milliseconds_from_drag_to_first_and_final_image() {
     let sizes: &[usize] = if given.is_some() { &[400, 800] } else { &[40] };
     for (run, &side) in runs.flat_map(|run| sizes.iter().map(move |side| (run, side))) {
         let server = serve(&place, &format!("view {run}"));
-        let (mut page, about) = Page::open(&server.address);
+        let (mut page, about) = Page::open(&server);
         let view = first(&about, [side, side]);
         // The first views measure the speed of the machine.
         page.look(0, &view);
@@ -1009,7 +1040,7 @@ fn what_pages_cost_training() {
             return [start.elapsed().as_secs_f64(), processor() - used];
         };
         let mut server = serve(&place, &command);
-        let (mut page, about) = Page::open(&server.address);
+        let (mut page, about) = Page::open(&server);
         let asked = match looks {
             true => json!({ "ask": "view", "id": 1, "view": first(&about, [400, 400]) }),
             false => json!({ "ask": "rest" }),
@@ -1062,13 +1093,13 @@ fn many_pages_do_not_affect_memory_or_training() {
             line.split_whitespace().nth(1)?.parse::<f64>().ok().map(|kilobytes| kilobytes / 1e3)
         }
     };
-    let (mut held, about) = Page::open(&server.address);
+    let (mut held, about) = Page::open(&server);
     held.say(json!({ "ask": "pause", "pause": true }));
     while held.text("training")["paused"] != true {}
     let before = memory();
     // Every third page reads nothing; pairs of pages share a view.
     let view = first(&about, [96, 96]);
-    let mut others: Vec<Page> = (0..pages).map(|_| Page::open(&server.address).0).collect();
+    let mut others: Vec<Page> = (0..pages).map(|_| Page::open(&server).0).collect();
     for (i, page) in others.iter_mut().enumerate() {
         page.say(json!({ "ask": "view", "id": 1, "view": turned(&view, 0.1 * (i / 2) as f64) }));
     }
@@ -1094,7 +1125,7 @@ fn many_pages_do_not_affect_memory_or_training() {
                 char::from(letters[(random >> 16) as usize % letters.len()])
             })
             .collect();
-        let (mut page, _) = Page::open(&server.address);
+        let (mut page, _) = Page::open(&server);
         page.socket.send(Message::text(text)).unwrap();
         let reason = page.closed();
         assert!(reason.contains(" at line 1 column ") || reason.contains("unknown variant"), "{reason}");

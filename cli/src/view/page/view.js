@@ -15,23 +15,65 @@ let keys = [];
 /** Number of the current playback. Any camera motion increments it, which stops playback. */
 let playing = 0;
 
+/** Access token of the link. */
+let token = "";
+
+/** Takes the token of the link out of the address bar and the history, and keeps it for reloads of this tab. */
+function takeToken() {
+  const given = new URLSearchParams(location.hash.slice(1)).get("token");
+  try {
+    if (given) sessionStorage.setItem("token", given);
+    token = given || sessionStorage.getItem("token") || "";
+    if (given) history.replaceState(null, "", location.pathname);
+  } catch {
+    // Without storage, reloads need the token in the address bar.
+    token = given || token;
+  }
+}
+
+/** An address of the server that needs the token. */
+function withToken(path) {
+  return new URL(`${path}?token=${encodeURIComponent(token)}`, location.href);
+}
+
+/** True if the server refuses the token. Browsers do not tell why a socket fails. */
+async function isRefused() {
+  try {
+    return (await fetch(withToken("access"))).status === 403;
+  } catch {
+    return false;
+  }
+}
+
 function connect() {
-  const address = new URL("messages" + location.search, location.href);
+  const address = withToken("messages");
   address.protocol = address.protocol.replace("http", "ws");
-  socket = new WebSocket(address);
+  const own = socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
   socket.onopen = () => { attempts = 0; $("lost").hidden = true; unseen = null; };
   socket.onmessage = (event) => (typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data));
-  socket.onclose = (event) => {
-    $("lost").textContent = training && training.ended ? "Training has ended and raygrad has exited. Open the run with raygrad view." : event.reason ? `raygrad closed the connection: ${event.reason}. Reconnecting…`
-      : attempts < 3 ? "raygrad does not respond. Reconnecting…"
-      // Browsers do not tell whether the server refused the token.
-      : "raygrad does not respond. If it was restarted, open the new link that it printed. Reconnecting…";
+  socket.onclose = async (event) => {
+    const refused = !event.reason && await isRefused();
+    // A new link may have opened another socket.
+    if (socket !== own) return;
+    $("lost").textContent = refused ? "This link does not open the viewer. Open the link that raygrad printed last."
+      : training && training.ended ? "Training has ended and raygrad has exited. Open the run with raygrad view."
+      : event.reason ? `raygrad closed the connection: ${event.reason}. Reconnecting…`
+      : "raygrad does not respond. Reconnecting…";
     $("lost").hidden = false;
+    if (refused) return;
     attempts += 1;
-    setTimeout(connect, Math.min(5000, 250 * 2 ** attempts));
+    setTimeout(() => { if (socket === own) connect(); }, Math.min(5000, 250 * 2 ** attempts));
   };
 }
+
+// A new link, opened in the same tab.
+addEventListener("hashchange", () => {
+  if (!location.hash) return;
+  takeToken();
+  socket.close();
+  connect();
+});
 
 function say(message) {
   if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
@@ -804,4 +846,5 @@ document.addEventListener("visibilitychange", () => {
 listen(stage);
 new ResizeObserver(() => { if (about) { layout(); ask(); } }).observe(stage);
 
+takeToken();
 connect();

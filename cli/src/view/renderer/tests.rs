@@ -1,6 +1,7 @@
 use serde_json::json;
 
 use super::*;
+use crate::view::networks::Network;
 use crate::view::requests::Outbox;
 use crate::view::row_tiles::tests::{fog, free};
 
@@ -15,7 +16,7 @@ fn expected_rate_is_the_geometric_mean() {
 #[test]
 fn sync_resting_job_restarts_when_due() {
     let requests = Arc::new(Requests::default());
-    let (client, _outbox) = requests.join(1).unwrap();
+    let (client, _outbox) = requests.join(Network::LOCAL, 1).unwrap();
     let view = json!({ "eye": { "photograph": 0 }, "size": [800, 800], "show": "color" });
     requests.wish(client, 1, serde_json::from_value(view).unwrap());
     let long_ago = Instant::now().checked_sub(2 * AGAIN).unwrap();
@@ -49,7 +50,7 @@ fn finer_for_paused_or_fast_models() {
 /// A renderer with one page that requests this view, and the page's outbox.
 fn renderer(view: View) -> (Renderer, u64, Arc<Outbox>) {
     let requests = Arc::new(Requests::default());
-    let (client, outbox) = requests.join(9).unwrap();
+    let (client, outbox) = requests.join(Network::LOCAL, 9).unwrap();
     requests.wish(client, 1, view);
     (Renderer::new(requests, None, None), client, outbox)
 }
@@ -65,7 +66,7 @@ fn text(outbox: &Outbox) -> String {
 fn prepare_limits_large_renders() {
     let (mut renderer, _, _) = renderer(free(0.0, [1100, 1000]));
     for x in 1..5 {
-        let (client, _) = renderer.requests.join(9).unwrap();
+        let (client, _) = renderer.requests.join(Network::LOCAL, 9).unwrap();
         renderer.requests.wish(client, 1, free(f64::from(x), [1100, 1000]));
     }
     renderer.rates.insert((Show::Color, None), 1e12);
@@ -76,7 +77,7 @@ fn prepare_limits_large_renders() {
     renderer.jobs[1].begin(0);
     assert!(renderer.prepare(4, &model, 0).is_some() && renderer.prepare(1, &model, 0).is_none());
     // A small render does not count towards the limit.
-    let (client, _) = renderer.requests.join(9).unwrap();
+    let (client, _) = renderer.requests.join(Network::LOCAL, 9).unwrap();
     renderer.requests.wish(client, 1, free(9.0, [1024, 1024]));
     renderer.sync(0);
     assert!(renderer.prepare(5, &model, 0).is_some());
@@ -154,7 +155,7 @@ fn work_or_wait_without_jobs_waits() {
 fn work_alternates_between_jobs() {
     let requests = Arc::new(Requests::default());
     for number in 0..2 {
-        let (client, _outbox) = requests.join(2).unwrap();
+        let (client, _outbox) = requests.join(Network::LOCAL, 2).unwrap();
         requests.wish(client, 1, free(f64::from(number), [512, 512]));
     }
     let model = fog();

@@ -33,7 +33,8 @@ fn sent(outbox: &Outbox) -> Option<u8> {
 fn pages_share_a_request_and_get_the_newest() {
     let requests = Requests::default();
     let ([a, b], [from_a, from_b]) = {
-        let [(a, out), (b, other)] = [requests.join(9), requests.join(9)].map(Option::unwrap);
+        let [(a, out), (b, other)] =
+            [requests.join(Network::LOCAL, 9), requests.join(Network::LOCAL, 9)].map(Option::unwrap);
         ([a, b], [out, other])
     };
     assert_eq!(requests.connected(), 2);
@@ -52,7 +53,7 @@ fn pages_share_a_request_and_get_the_newest() {
     from_a.seen(1);
     assert_eq!([sent(&from_a), sent(&from_a)], [Some(0), None]);
     // A later page gets the existing render at once.
-    let (c, from_c) = requests.join(9).unwrap();
+    let (c, from_c) = requests.join(Network::LOCAL, 9).unwrap();
     requests.wish(c, 3, view(1));
     assert_eq!(sent(&from_c), Some(0));
     requests.leave(c);
@@ -79,17 +80,36 @@ fn pages_share_a_request_and_get_the_newest() {
 }
 
 #[test]
+fn page_of_a_crowded_network_gives_way() {
+    let requests = Requests::default();
+    let [crowd, other] = ["10.0.0.1", "10.0.0.2"].map(|ip| Network::of(ip.parse().unwrap()));
+    let join = |network| requests.join(network, 3);
+    let first: Vec<_> = (0..3).map(|_| join(crowd).unwrap()).collect();
+    assert!(join(crowd).is_none(), "no network replaces its own");
+    let closed = || first.iter().map(|(_, outbox)| outbox.closing().is_some()).collect::<Vec<_>>();
+    let _second = join(other).unwrap();
+    assert_eq!((requests.connected(), closed()), (3, vec![false, false, true]));
+    assert!(!requests.is_here(first[2].0));
+    // Two pages and one: neither gives way any more.
+    assert!(join(other).is_none() && join(crowd).is_none());
+    assert_eq!(closed(), [false, false, true]);
+    // The end of a closed page changes nothing.
+    requests.leave(first[2].0);
+    assert_eq!(requests.connected(), 3);
+}
+
+#[test]
 fn outbox_over_the_limit_is_overrun() {
     let requests = Requests::default();
-    let (page, outbox) = requests.join(9).unwrap();
+    let (page, outbox) = requests.join(Network::LOCAL, 9).unwrap();
     assert!((0..SAVES).all(|i| requests.save(page, view(i))) && !requests.save(page, view(9)));
-    let (other, _) = requests.join(2).unwrap();
-    assert!(requests.join(2).is_none());
+    let (other, _) = requests.join(Network::LOCAL, 2).unwrap();
+    assert!(requests.join(Network::LOCAL, 2).is_none());
     assert!(requests.save(other, view(0)), "each its own");
     requests.leave(page);
     assert!(requests.next_save().is_some_and(|save| save.client == other) && requests.next_save().is_none());
     // Saves keep their order. Rendered but unsent saves count towards the limit.
-    let (third, files) = requests.join(9).unwrap();
+    let (third, files) = requests.join(Network::LOCAL, 9).unwrap();
     requests.save(third, view(1));
     requests.save(third, view(2));
     let numbers = [(); 2].map(|()| requests.next_save().unwrap().view.eye);
@@ -108,21 +128,21 @@ fn outbox_over_the_limit_is_overrun() {
     for _ in 0..WAITING {
         outbox.post(Outgoing::Text(String::new()));
     }
-    assert!(!outbox.is_overrun());
+    assert!(outbox.closing().is_none());
     // The overrun is permanent, and excess messages are dropped.
     for _ in 0..2 {
         outbox.post(Outgoing::Bytes(vec![]));
-        assert!(outbox.is_overrun() && outbox.files() == 0);
+        assert!(outbox.closing().is_some() && outbox.files() == 0);
     }
     assert_eq!(std::iter::from_fn(|| outbox.take()).count(), WAITING);
     outbox.post(Outgoing::Text(String::new()));
-    assert!(outbox.is_overrun() && outbox.take().is_none());
+    assert!(outbox.closing().is_some() && outbox.take().is_none());
 }
 
 #[test]
 fn render_of_old_request_is_dropped() {
     let requests = Requests::default();
-    let (page, outbox) = requests.join(9).unwrap();
+    let (page, outbox) = requests.join(Network::LOCAL, 9).unwrap();
     let wish = |id: u32| {
         requests.wish(page, id, view(1));
         let wish = requests.wishes().pop().unwrap();
@@ -155,7 +175,7 @@ fn render_of_old_request_is_dropped() {
 #[test]
 fn outbox_notifies_of_each_message() {
     let requests = Requests::default();
-    let (page, outbox) = requests.join(9).unwrap();
+    let (page, outbox) = requests.join(Network::LOCAL, 9).unwrap();
     let is_woken = || outbox.changed.notified().now_or_never().is_some();
     assert!(!is_woken());
     requests.wish(page, 1, view(1));
@@ -178,7 +198,8 @@ fn outbox_notifies_of_each_message() {
 #[test]
 fn messages_reach_their_pages_only() {
     let requests = Requests::default();
-    let [(a, from_a), (b, from_b)] = [requests.join(9), requests.join(9)].map(Option::unwrap);
+    let [(a, from_a), (b, from_b)] =
+        [requests.join(Network::LOCAL, 9), requests.join(Network::LOCAL, 9)].map(Option::unwrap);
     assert_ne!(a, b);
     let say = |text: &str| Outgoing::Text(text.to_owned());
     requests.post(a, say("one"));
@@ -199,7 +220,7 @@ fn is_news(requests: &Requests) -> bool {
 #[test]
 fn renderer_is_woken_by_every_change() {
     let requests = Requests::default();
-    let (page, _outbox) = requests.join(9).unwrap();
+    let (page, _outbox) = requests.join(Network::LOCAL, 9).unwrap();
     assert!(!requests.paused() && !requests.stops() && !is_news(&requests));
     let changes: [&dyn Fn(); 6] = [
         &|| requests.wish(page, 1, view(1)),

@@ -1,3 +1,4 @@
+use std::io::ErrorKind::{TimedOut, WouldBlock};
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::Instant;
@@ -25,10 +26,24 @@ fn served_at(host: &str, limits: Limits) -> (String, Arc<Requests>) {
     (link.strip_prefix("http://").unwrap().to_owned(), requests)
 }
 
-/// Starts a local server and returns its address.
-fn served(limits: Limits) -> (String, Arc<Requests>) {
+/// The host and the token of a link.
+fn parts(link: &str) -> (String, String) {
+    let (address, token) = link.split_once("/#token=").unwrap();
+    (address.trim_start_matches("http://").to_owned(), token.to_owned())
+}
+
+/// Address and token of a local server.
+#[derive(Clone)]
+struct Local {
+    address: String,
+    token: String,
+}
+
+/// Starts a local server.
+fn served(limits: Limits) -> (Local, Arc<Requests>) {
     let (link, requests) = served_at("127.0.0.1", limits);
-    (link.strip_suffix('/').unwrap().to_owned(), requests)
+    let (address, token) = parts(&link);
+    (Local { address, token }, requests)
 }
 
 fn connect(address: &str) -> TcpStream {
@@ -63,8 +78,8 @@ fn upgraded(address: &str, path: &str, origin: Option<&str>) -> (TcpStream, Stri
 }
 
 /// Like [`upgraded`], with the origin of a page.
-fn joined(address: &str) -> (TcpStream, String) {
-    upgraded(address, "/messages", Some(&format!("http://{address}")))
+fn joined(Local { address, token }: &Local) -> (TcpStream, String) {
+    upgraded(address, &format!("/messages?token={token}"), Some(&format!("http://{address}")))
 }
 
 /// Waits until the condition holds.
@@ -84,15 +99,15 @@ struct Client {
 }
 
 impl Client {
-    fn open(address: &str) -> Self {
-        let mut page = Client::connect(address);
+    fn open(server: &Local) -> Self {
+        let mut page = Client::connect(server);
         assert_eq!(page.text()["tell"], "about");
         page
     }
 
     /// Connects without reading a message.
-    fn connect(address: &str) -> Self {
-        let request = Request::builder().uri(format!("ws://{address}/messages"));
+    fn connect(Local { address, token }: &Local) -> Self {
+        let request = Request::builder().uri(format!("ws://{address}/messages?token={token}"));
         let request = request.header("Host", address).header("Origin", format!("http://{address}"));
         let request = request.header("Connection", "Upgrade").header("Upgrade", "websocket");
         let request = request.header("Sec-WebSocket-Version", "13").header("Sec-WebSocket-Key", generate_key());
@@ -147,7 +162,7 @@ type Result<T, E> = std::result::Result<T, E>;
 fn server_refuses_other_hosts_and_other_paths() {
     let listener = Listener::bind("127.0.0.1", 0).unwrap();
     let link = serve(listener, Arc::new(Requests::default()), None, None, [1.0; 3]).unwrap();
-    let address = link.strip_prefix("http://").unwrap().strip_suffix('/').unwrap().to_owned();
+    let (address, token) = parts(&link);
     let port = address.rsplit(':').next().unwrap();
     let taken = Listener::bind("127.0.0.1", port.parse().unwrap()).map(drop).unwrap_err().to_string();
     assert!(taken.contains(port) && taken.contains("cannot be used"), "{taken}");
@@ -198,13 +213,14 @@ fn server_refuses_other_hosts_and_other_paths() {
         (format!("GET //etc/passwd HTTP/1.1\r\nHost: {address}"), 404, "No such page"),
         (format!("GET /config.json HTTP/1.1\r\nHost: {address}"), 404, "No such page"),
         (format!("GET /messages HTTP/1.1\r\nHost: {address}"), 400, ""),
+        (format!("GET /access HTTP/1.1\r\nHost: {address}"), 403, "Open the link that raygrad printed"),
     ] {
         let (status, answered, body) = request(&address, &head);
         assert!(status == expected && body.contains(what) && !body.contains("root:"), "{head}: {status} {body}");
         told(&answered);
     }
     for origin in [None, Some("http://evil.example"), Some("http://127.0.0.1:1"), Some("null")] {
-        assert_eq!(upgraded(&address, "/messages", origin).1, "403", "{origin:?}");
+        assert_eq!(upgraded(&address, &format!("/messages?token={token}"), origin).1, "403", "{origin:?}");
     }
     // A long request head is refused.
     let long = format!("GET / HTTP/1.1\r\nHost: {address}\r\nX-Long: {}", "x".repeat(8000));
@@ -213,45 +229,47 @@ fn server_refuses_other_hosts_and_other_paths() {
 }
 
 #[test]
-fn server_on_all_addresses_needs_the_token() {
-    let (link, requests) = served_at("0.0.0.0", Limits::USUAL);
-    let (host, token) = link.split_once("/?token=").unwrap();
-    assert!(token.len() == 32 && token.bytes().all(|byte| byte.is_ascii_hexdigit()), "{token}");
-    let address = format!("127.0.0.1:{}", host.rsplit(':').next().unwrap());
-    let status = |path: &str| request(&address, &format!("GET {path} HTTP/1.1\r\nHost: {address}")).0;
-    assert_eq!(status(&format!("/?token={token}")), 200);
-    // Style sheet and scripts need no token.
-    assert_eq!(["/view.css", "/camera.js", "/view.js"].map(status), [200; 3]);
-    let other = |digit: char| if digit == '0' { '1' } else { '0' };
-    let near = format!("{}{}", &token[..31], other(token.chars().last().unwrap()));
-    for path in ["/", "/?token=", "/?token=0123", &format!("/?token={near}"), &format!("/?token={token}0")] {
-        assert_eq!(status(path), 403, "{path}");
+fn messages_need_the_token() {
+    for host in ["127.0.0.1", "0.0.0.0"] {
+        let (link, requests) = served_at(host, Limits::USUAL);
+        let (address, token) = parts(&link);
+        assert!(token.len() == 32 && token.bytes().all(|byte| byte.is_ascii_hexdigit()), "{token}");
+        let address = format!("127.0.0.1:{}", address.rsplit(':').next().unwrap());
+        let status = |path: &str| request(&address, &format!("GET {path} HTTP/1.1\r\nHost: {address}")).0;
+        // The files hold no data of the scene.
+        assert_eq!(["/", "/view.css", "/camera.js", "/view.js"].map(status), [200; 4]);
+        let other = |digit: char| if digit == '0' { '1' } else { '0' };
+        let near = format!("{}{}", &token[..31], other(token.chars().last().unwrap()));
+        let origin = format!("http://{address}");
+        let joins = |query: &str| upgraded(&address, &format!("/messages{query}"), Some(&origin)).1;
+        let queries = ["", "?token=", "?token=1", &format!("?token={near}"), &format!("?token={token}0")];
+        for query in queries {
+            // The page asks for the status without an upgrade.
+            assert_eq!((&*joins(query), status(&format!("/access{query}"))), ("403", 403), "{query}");
+        }
+        assert_eq!(requests.connected(), 0);
+        let query = format!("?token={token}");
+        assert_eq!((&*joins(&query), status(&format!("/access{query}"))), ("101", 204));
+        assert_eq!(upgraded(&address, &format!("/messages?token={token}"), None).1, "403");
+        becomes(|| requests.connected() == 0);
+        // Unknown host names are refused, as no name was given.
+        let (status, _, body) = request(&address, "GET / HTTP/1.1\r\nHost: box.lan");
+        assert!(status == 421 && body.contains("--host NAME"), "{body}");
     }
-    let origin = format!("http://{address}");
-    let joins = |query: &str| upgraded(&address, &format!("/messages{query}"), Some(&origin)).1;
-    assert_eq!(
-        ["", "?token=1", &format!("?token={near}"), &format!("?token={token}")].map(joins),
-        ["403", "403", "403", "101"]
-    );
-    assert_eq!(upgraded(&address, &format!("/messages?token={token}"), None).1, "403");
-    becomes(|| requests.connected() == 0);
-    // Unknown host names are refused, as no name was given.
-    let (status, _, body) = request(&address, &format!("GET /?token={token} HTTP/1.1\r\nHost: box.lan"));
-    assert!(status == 421 && body.contains("--host NAME"), "{body}");
 }
 
 #[test]
 fn link_uses_a_reachable_address() {
-    let of = |address: &str, host, outward: Option<&str>, token| {
-        link(address.parse().unwrap(), host, outward.map(|ip| ip.parse().unwrap()), token)
+    let of = |address: &str, host, outward: Option<&str>| {
+        link(address.parse().unwrap(), host, outward.map(|ip| ip.parse().unwrap()), "abc")
     };
-    assert_eq!(of("127.0.0.1:7007", "localhost", None, None), "http://127.0.0.1:7007/");
-    assert_eq!(of("[::1]:80", "::1", Some("10.0.0.2"), None), "http://[::1]:80/");
-    assert_eq!(of("10.0.0.2:80", "box.lan", Some("10.0.0.3"), Some("abc")), "http://box.lan:80/?token=abc");
+    assert_eq!(of("127.0.0.1:7007", "localhost", None), "http://127.0.0.1:7007/#token=abc");
+    assert_eq!(of("[::1]:80", "::1", Some("10.0.0.2")), "http://[::1]:80/#token=abc");
+    assert_eq!(of("10.0.0.2:80", "box.lan", Some("10.0.0.3")), "http://box.lan:80/#token=abc");
     // The outward address, if there is a network.
-    assert_eq!(of("0.0.0.0:80", "0.0.0.0", Some("10.0.0.2"), Some("abc")), "http://10.0.0.2:80/?token=abc");
-    assert_eq!(of("[::]:80", "::", Some("2001:db8::2"), None), "http://[2001:db8::2]:80/");
-    assert_eq!(of("0.0.0.0:80", "0.0.0.0", None, None), "http://0.0.0.0:80/");
+    assert_eq!(of("0.0.0.0:80", "0.0.0.0", Some("10.0.0.2")), "http://10.0.0.2:80/#token=abc");
+    assert_eq!(of("[::]:80", "::", Some("2001:db8::2")), "http://[2001:db8::2]:80/#token=abc");
+    assert_eq!(of("0.0.0.0:80", "0.0.0.0", None), "http://0.0.0.0:80/#token=abc");
 }
 
 #[test]
@@ -267,8 +285,8 @@ fn outward_gives_the_local_address() {
 
 #[test]
 fn malformed_message_closes_its_connection() {
-    let (address, requests) = served(Limits { rate: 0.0, burst: 3.0, ..Limits::USUAL });
-    let mut good = Client::open(&address);
+    let (server, requests) = served(Limits { rate: 0.0, burst: 3.0, ..Limits::USUAL });
+    let mut good = Client::open(&server);
     // Long reasons are cut at a character.
     let long = json!({ "ask": "\u{e4}".repeat(100) }).to_string();
     for (message, expected) in [
@@ -277,13 +295,13 @@ fn malformed_message_closes_its_connection() {
         (Message::text(json!({ "ask": "share", "share": 0.95 }).to_string()), "`share` must be from 0 to 0.9"),
         (Message::binary(vec![1, 2, 3]), "messages must be text"),
     ] {
-        let mut page = Client::open(&address);
+        let mut page = Client::open(&server);
         page.socket.send(message.clone()).unwrap();
         let (_, reason) = page.closed();
         assert!(reason.contains(expected) && reason.len() <= 123, "{message:?}: {reason}");
     }
     // The largest burst, and one message more.
-    let mut page = Client::open(&address);
+    let mut page = Client::open(&server);
     for _ in 0..3 {
         page.say(&json!({ "ask": "end-video" }));
     }
@@ -303,9 +321,9 @@ fn malformed_message_closes_its_connection() {
 
 #[test]
 fn message_over_the_limit_closes_the_page() {
-    let (address, requests) = served(Limits::USUAL);
+    let (server, requests) = served(Limits::USUAL);
     let message = json!({ "ask": "share", "share": 0.5 }).to_string();
-    let mut page = Client::open(&address);
+    let mut page = Client::open(&server);
     page.socket.send(Message::text(format!("{}{message}", " ".repeat((1 << 14) - message.len())))).unwrap();
     becomes(|| requests.share() == 0.5);
     requests.set_share(0.0);
@@ -319,15 +337,15 @@ fn message_over_the_limit_closes_the_page() {
 fn server_limits_the_number_of_pages() {
     // A page does not occupy a connection permit.
     let silence = Duration::from_millis(400);
-    let (address, requests) = served(Limits { pages: 3, connections: 1, silence, ..Limits::USUAL });
+    let (server, requests) = served(Limits { pages: 3, connections: 1, silence, ..Limits::USUAL });
     let start = Instant::now();
-    let mut pages: Vec<_> = (0..3).map(|_| joined(&address)).collect();
+    let mut pages: Vec<_> = (0..3).map(|_| joined(&server)).collect();
     assert!(pages.iter().all(|(_, status)| status == "101"));
-    let full = joined(&address).1;
+    let full = joined(&server).1;
     assert!(full == "503" || start.elapsed() >= silence, "{full}");
     pages.pop();
     becomes(|| {
-        let page = joined(&address);
+        let page = joined(&server);
         let is_in = page.1 == "101";
         pages.extend(is_in.then_some(page));
         is_in
@@ -341,9 +359,9 @@ fn server_limits_the_number_of_pages() {
 fn idle_page_is_pinged_and_stays() {
     let (idle, silence) = (Duration::from_millis(100), Duration::from_secs(2));
     let connected = Duration::from_millis(200);
-    let (address, requests) = served(Limits { idle, silence, connected, ..Limits::USUAL });
+    let (server, requests) = served(Limits { idle, silence, connected, ..Limits::USUAL });
     let start = Instant::now();
-    let mut page = Client::open(&address);
+    let mut page = Client::open(&server);
     let mut pings = 0;
     requests.tell_state("{}");
     while start.elapsed() < silence + silence / 2 {
@@ -364,9 +382,9 @@ fn idle_page_is_pinged_and_stays() {
 #[test]
 fn slow_page_is_kept_during_a_long_message() {
     let silence = Duration::from_millis(200);
-    let (address, requests) = served(Limits { silence, ..Limits::USUAL });
+    let (server, requests) = served(Limits { silence, ..Limits::USUAL });
     requests.introduce("x".repeat(HUGE));
-    let mut page = Client::connect(&address);
+    let mut page = Client::connect(&server);
     std::thread::sleep(3 * silence);
     assert_eq!(requests.connected(), 1);
     let message = page.read().unwrap();
@@ -376,8 +394,8 @@ fn slow_page_is_kept_during_a_long_message() {
 #[test]
 fn unread_messages_time_out() {
     let patience = Duration::from_millis(200);
-    let (address, requests) = served(Limits { patience, slowest: 1 << 40, ..Limits::USUAL });
-    let page = Client::open(&address);
+    let (server, requests) = served(Limits { patience, slowest: 1 << 40, ..Limits::USUAL });
+    let page = Client::open(&server);
     let start = Instant::now();
     requests.tell(&Outgoing::Bytes(vec![7; HUGE]));
     becomes(|| requests.connected() == 0);
@@ -387,8 +405,8 @@ fn unread_messages_time_out() {
 
 #[test]
 fn overrun_page_gets_the_reason() {
-    let (address, requests) = served(Limits::USUAL);
-    let mut page = Client::open(&address);
+    let (server, requests) = served(Limits::USUAL);
+    let mut page = Client::open(&server);
     // This message exceeds the socket buffers, so that all others wait.
     requests.tell(&Outgoing::Bytes(vec![7; HUGE]));
     for _ in 0..100 {
@@ -413,8 +431,8 @@ fn view() -> View {
 #[test]
 fn unacknowledged_render_closes_the_page() {
     let patience = Duration::from_secs(1);
-    let (address, requests) = served(Limits { patience, ..Limits::USUAL });
-    let mut page = Client::open(&address);
+    let (server, requests) = served(Limits { patience, ..Limits::USUAL });
+    let mut page = Client::open(&server);
     page.say(&json!({ "ask": "view", "id": 1, "view": { "eye": { "photograph": 0 }, "size": [8, 8] } }));
     becomes(|| !requests.wishes().is_empty());
     assert_eq!(requests.wishes()[0].view, view());
@@ -442,18 +460,33 @@ fn unacknowledged_render_closes_the_page() {
 #[test]
 fn silent_connections_time_out() {
     let patience = Duration::from_millis(300);
-    let (address, _) = served(Limits { connections: 3, patience, ..Limits::USUAL });
+    let (Local { address, .. }, _) = served(Limits { patience, ..Limits::USUAL });
     let start = Instant::now();
-    let idle: Vec<TcpStream> = (0..3).map(|_| connect(&address)).collect();
+    let mut idle = connect(&address);
+    let mut answer = Vec::new();
+    let _ = idle.read_to_end(&mut answer);
+    assert!(start.elapsed() >= patience && start.elapsed() < LONG / 2, "{:?}", start.elapsed());
+}
+
+#[test]
+fn silent_connections_delay_no_other() {
+    let (Local { address, .. }, _) = served(Limits { connections: 3, patience: 2 * LONG, ..Limits::USUAL });
+    let idle: Vec<TcpStream> = (0..20).map(|_| connect(&address)).collect();
     let (status, _, _) = request(&address, &format!("GET / HTTP/1.1\r\nHost: {address}"));
     assert_eq!(status, 200);
-    assert!(start.elapsed() >= patience && start.elapsed() < LONG / 2, "{:?}", start.elapsed());
-    drop(idle);
+    // The oldest were closed, and the last ones wait.
+    let is_open = |mut stream: &TcpStream| {
+        stream.set_read_timeout(Some(Duration::from_millis(50))).unwrap();
+        matches!(stream.read(&mut [0]), Err(error) if [WouldBlock, TimedOut].contains(&error.kind()))
+    };
+    let open: Vec<bool> = idle.iter().map(is_open).collect();
+    assert!(open[..17].iter().all(|open| !open) && open[18..].iter().all(|open| *open), "{open:?}");
 }
 
 #[test]
 fn connection_without_upgrade_times_out() {
-    let (address, _) = served(Limits { connected: Duration::from_millis(200), patience: 2 * LONG, ..Limits::USUAL });
+    let (Local { address, .. }, _) =
+        served(Limits { connected: Duration::from_millis(200), patience: 2 * LONG, ..Limits::USUAL });
     let mut stream = connect(&address);
     stream.write_all(format!("GET /nothing HTTP/1.1\r\nHost: {address}\r\n\r\n").as_bytes()).unwrap();
     let mut answer = String::new();

@@ -271,7 +271,18 @@ impl Browser {
 
     /// Opens a program's page and waits for the scene.
     pub fn visit(&mut self, server: &Server) {
-        self.go(&format!("http://{}/", server.address));
+        self.go(&server.link());
+        self.sees_the_scene();
+    }
+
+    /// Opens the page again, as it is in the address bar, and waits for the scene.
+    pub fn reload(&mut self) {
+        let url = self.value("location.href").as_str().unwrap().to_owned();
+        self.go(&url);
+        self.sees_the_scene();
+    }
+
+    fn sees_the_scene(&mut self) {
         self.rested();
         // The layout may change the canvas size once more.
         self.until("String(shown.size) === String(sizes())");
