@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 pub struct Viewpoint {
     /// Width of the training images. Unit: pixels. Range: 1 to 65536.
     pub width: usize,
-    /// Height of the training images. Unit: pixels. Range: 1 to 65536.
+    /// Height of the training images. Unit: pixels. Range: 1 to 65536, and at most 2^28 pixels with `width`.
     pub height: usize,
     /// Horizontal field of view. Unit: radians. Range: more than 0 and less than pi.
     pub angle_x: f64,
@@ -47,6 +47,9 @@ const FROM_CENTRE: f64 = 0.02;
 /// Largest side of a training image in pixels. Larger values come from damaged files.
 const LARGEST: usize = 1 << 16;
 
+/// Most pixels of a training image, as of every image.
+const MOST_PIXELS: usize = 1 << 28;
+
 impl Viewpoint {
     /// The average of a dataset's cameras. The dataset is not empty.
     pub fn of(data: &Dataset) -> Self {
@@ -73,6 +76,12 @@ impl Viewpoint {
         let checks = [
             ("viewpoint.width", self.width as f64, (1..=LARGEST).contains(&self.width), "1 to 65536"),
             ("viewpoint.height", self.height as f64, (1..=LARGEST).contains(&self.height), "1 to 65536"),
+            (
+                "viewpoint.height",
+                self.height as f64,
+                self.width.saturating_mul(self.height) <= MOST_PIXELS,
+                "at most 2^28 pixels in all",
+            ),
             (
                 "viewpoint.angle_x",
                 self.angle_x,

@@ -34,11 +34,6 @@ pub fn taken_memory() -> Option<u64> {
     proc_bytes("/proc/self/status", "VmRSS")
 }
 
-/// Memory available to programs in bytes, if the system reports it.
-pub fn available_memory() -> Option<u64> {
-    proc_bytes("/proc/meminfo", "MemAvailable")
-}
-
 /// The first `name:` value of a file in `/proc`, converted from kB to bytes.
 fn proc_bytes(file: &str, name: &str) -> Option<u64> {
     let kib: u64 = proc_value(file, name)?.strip_suffix("kB")?.trim().parse().ok()?;

@@ -1,9 +1,9 @@
 //! Estimates of the memory for training.
 
 use raygrad::nerf::dataset::{Dataset, Frame};
-use raygrad::nerf::{BatchSize, Trainer};
+use raygrad::nerf::{BatchSize, Camera, Error, Result, Trainer, available_memory};
 
-use super::machine;
+use super::parse::LARGEST;
 
 /// Bytes of the program itself: code, threads, and initialisation in the first step.
 const PROGRAM: f64 = 1e8;
@@ -11,14 +11,13 @@ const PROGRAM: f64 = 1e8;
 const PARAMETER: f64 = 40.0;
 /// Bytes per cell of an occupancy grid.
 const CELL: f64 = 12.0;
-/// Bytes for each pixel of an image that is read.
-const PIXEL: f64 = 3.0;
-/// Bytes of images that raygrad warns of if the free memory is unknown.
-const HEAVY: f64 = 4e9;
-/// Largest factor of `--downscale`.
-const MOST_DOWNSCALE: usize = 1 << 14;
 /// Bytes for each sample of a step, on the tape and in gradients that are not yet added up.
 const SAMPLE: f64 = 3300.0;
+
+/// Bytes per pixel of a render, with its encoded file.
+const RENDERED: f64 = 40.0;
+/// Most pixels of a render.
+const MOST_PIXELS: usize = LARGEST * LARGEST;
 
 /// Estimated bytes of training, images included. `docs/benchmarks/results.md` has the measured values.
 pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
@@ -40,17 +39,6 @@ fn bytes(frame: &Frame) -> f64 {
     (frame.image.bytes() + frame.distances.as_ref().map_or(0, |distances| 4 * distances.data.len())) as f64
 }
 
-/// Free bytes of the machine or of the cgroup, whichever is less, if the system reports them.
-pub fn available() -> Option<f64> {
-    let group = || {
-        let read =
-            |name: &str| std::fs::read_to_string(format!("/sys/fs/cgroup/{name}")).ok()?.trim().parse::<f64>().ok();
-        Some((read("memory.max")? - read("memory.current")?).max(0.0))
-    };
-    let machine = machine::available_memory().map(|bytes| bytes as f64);
-    [machine, group()].into_iter().flatten().reduce(f64::min)
-}
-
 /// The warning if training needs more bytes than are free.
 pub fn shortage(need: f64, free: f64) -> Option<String> {
     let [needed, left] = [need, free].map(|bytes| bytes / 1e9);
@@ -62,21 +50,36 @@ pub fn shortage(need: f64, free: f64) -> Option<String> {
     })
 }
 
-/// The warning if `count` images need more bytes than are free, or more than many computers have. `pixels` is their
-/// number at full size, and `--downscale` divides both sides.
-pub fn image_shortage(count: usize, pixels: f64, downscale: usize, free: Option<f64>) -> Option<String> {
-    let bytes = |downscale: usize| PIXEL * pixels / (downscale as f64).powi(2);
-    let limit = free.unwrap_or(HEAVY);
-    if bytes(downscale) <= limit {
-        return None;
+/// Checks the size of renders, before the first one.
+///
+/// # Errors
+///
+/// Fails if a render has more than 2^28 pixels, or needs more memory than is free.
+pub fn check_renders(cameras: &[Camera]) -> Result<()> {
+    let of = |camera: &Camera| (camera.width.saturating_mul(camera.height), [camera.width, camera.height]);
+    match cameras.iter().map(of).max() {
+        Some((_, size)) => check_render(size, available_memory()),
+        None => Ok(()),
     }
-    let enough = (downscale..=MOST_DOWNSCALE).find(|k| bytes(*k) <= 0.5 * limit).unwrap_or(downscale);
-    let [needed, less] = [downscale, enough].map(|downscale| bytes(downscale) / 1e9);
-    let left = free.map_or("the free memory is unknown".to_owned(), |free| format!("{:.1} GB are free", free / 1e9));
-    Some(format!(
-        "warning: {count} images need about {needed:.1} GB of memory, but {left}: --downscale {enough} needs {less:.1} \
-         GB"
-    ))
+}
+
+fn check_render([width, height]: [usize; 2], free: Option<u64>) -> Result<()> {
+    let pixels = width.saturating_mul(height);
+    if pixels > MOST_PIXELS {
+        return Err(Error::setting("size", format!("{width}x{height} pixels are more than the limit of 2^28")));
+    }
+    let need = pixels as f64 * RENDERED;
+    match free.map(|free| free as f64) {
+        Some(free) if need > free => {
+            let [need, free] = [need, free].map(|bytes| bytes / 1e9);
+            let what = format!(
+                "a render of {width}x{height} pixels needs {need:.1} GB of memory, but {free:.1} GB are free: use a \
+                 smaller size"
+            );
+            Err(Error::setting("size", what))
+        }
+        _ => Ok(()),
+    }
 }
 
 #[cfg(test)]
@@ -97,19 +100,15 @@ mod tests {
     }
 
     #[test]
-    fn image_warning_names_a_sufficient_downscale() {
-        // 100 images of 10 by 10 thousand pixels: 30 GB, and 7.5, 3.33 and 1.875 at a half, a third and a quarter.
-        let warning = |downscale, free| image_shortage(100, 1e10, downscale, free);
-        let expected = "warning: 100 images need about 30.0 GB of memory, but 8.0 GB are free: --downscale 3 needs 3.3 \
-                        GB";
-        assert_eq!(warning(1, Some(8e9)).as_deref(), Some(expected));
-        let expected = "warning: 100 images need about 7.5 GB of memory, but 7.0 GB are free: --downscale 3 needs 3.3 \
-                        GB";
-        assert_eq!(warning(2, Some(7e9)).as_deref(), Some(expected));
-        let expected = "warning: 100 images need about 7.5 GB of memory, but the free memory is unknown: --downscale 4 \
-                        needs 1.9 GB";
-        assert_eq!(warning(2, None).as_deref(), Some(expected));
-        assert_eq!([warning(1, Some(3e10)), warning(2, Some(7.5e9)), warning(3, None)], [None, None, None]);
+    fn render_beyond_limit_or_memory_is_an_error() {
+        let fails = |size, free| check_render(size, free).unwrap_err().to_string();
+        assert!(check_render([16_384, 16_384], None).is_ok() && check_render([32_768, 8192], Some(1 << 40)).is_ok());
+        let expected = "`size`: 16385x16384 pixels are more than the limit of 2^28";
+        assert_eq!(fails([16_385, 16_384], None), expected);
+        let expected = "`size`: a render of 8000x5000 pixels needs 1.6 GB of memory, but 1.5 GB are free: use a \
+                        smaller size";
+        assert_eq!(fails([8000, 5000], Some(1_500_000_000)), expected);
+        assert!(check_render([8000, 5000], Some(1_600_000_000)).is_ok() && check_renders(&[]).is_ok());
     }
 
     #[test]
@@ -137,6 +136,5 @@ mod tests {
         assert!((least_of(need(8, 8, 16, 3072)) - 3300.0 * 2048.0).abs() < 1.0);
         let whole = 1e8 + 60.0 * 64.0 * 16.0 + 40.0 * elements + 12.0 * 4096.0 + 3300.0 * 1024.0;
         assert!((least - whole).abs() < 1.0, "{least} {whole}");
-        assert!(available().is_none_or(|free| free > 0.0));
     }
 }

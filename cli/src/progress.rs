@@ -5,6 +5,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use raygrad::nerf::available_memory;
 use raygrad::tensor::parallel;
 
 use super::interrupt::{self, Stop, Work};
@@ -47,15 +48,17 @@ impl Progress {
         self.set(done as f64 / total as f64, || format!("{done} of {total} {words}"));
     }
 
-    /// Runs `total` tasks in parallel and shows the number of finished ones, like [`count`](Self::count).
+    /// Runs a task for each of `costs`, its bytes of memory, and shows the number of finished ones, like
+    /// [`count`](Self::count). Tasks run in parallel as far as half of the free memory allows.
     ///
     /// # Errors
     ///
     /// Returns the first error by task number after all tasks have ended. After a Ctrl-C no task starts, and the error
     /// is [`Stop::Interrupted`].
-    pub fn each<R: Send>(&self, total: usize, words: &str, work: impl Fn(usize) -> Work<R> + Sync) -> Work<Vec<R>> {
-        let done = AtomicUsize::new(0);
-        let results = parallel::collect(total, |i| {
+    pub fn each<R: Send>(&self, costs: &[u64], words: &str, work: impl Fn(usize) -> Work<R> + Sync) -> Work<Vec<R>> {
+        let (done, total) = (AtomicUsize::new(0), costs.len());
+        let limit = available_memory().map_or(u64::MAX, |free| free / 2);
+        let results = parallel::collect_within(costs, limit, |i| {
             if interrupt::requested() {
                 return Err(Stop::Interrupted);
             }

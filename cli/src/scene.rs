@@ -131,7 +131,7 @@ impl Opened {
                 capture.load(
                     split,
                     analysis,
-                    &LoadOptions { downscale, views, distances: self.depth, progress: &show },
+                    &LoadOptions { downscale, views, distances: self.depth, memory: None, progress: &show },
                 )?
             }
         };

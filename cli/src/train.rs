@@ -13,7 +13,7 @@ use raygrad::Schedule;
 use raygrad::nerf::dataset::{Dataset, SceneType, Split};
 use raygrad::nerf::model::RefinedParam;
 use raygrad::nerf::space::occupancy::Skip;
-use raygrad::nerf::{Background, Budget, Error, Preset, Result, StepStats, Trainer};
+use raygrad::nerf::{Background, Budget, Error, Preset, Result, StepStats, Trainer, available_memory};
 use serde_json::Value;
 
 use super::lock::Lock;
@@ -242,7 +242,6 @@ fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
     let mut scene = args.scene.open(args.scene_type)?;
     scene.depth = args.has_depth_loss();
-    warn_of_memory(&scene, args.downscale);
     let mut data = scene.load(Split::Train, args.downscale, usize::MAX)?;
     if let Some(near) = args.near {
         set_near(&mut data, near)?;
@@ -370,20 +369,11 @@ fn train(
     Ok(Trained { folder: run.folder, interrupted, diverged: diverged.is_some() })
 }
 
-/// Warns before images are read that need more memory than is free.
-fn warn_of_memory(scene: &Opened, downscale: usize) {
-    let Some((capture, _)) = &scene.capture else { return };
-    let pixels = capture.present().map(|view| view.camera.width as f64 * view.camera.height as f64).sum();
-    if let Some(warning) = memory::image_shortage(capture.present().count(), pixels, downscale, memory::available()) {
-        complain(&warning);
-    }
-}
-
 /// Prints the estimated memory of training, and a warning if it is not free. Memory in use by this process is not
 /// counted twice.
 fn foresee_memory(trainer: &Trainer, data: &Dataset) -> Result<()> {
     let need = memory::need(trainer, data);
-    let free = memory::available().map(|free| free + machine::taken_memory().unwrap_or(0) as f64);
+    let free = available_memory().map(|free| free as f64 + machine::taken_memory().unwrap_or(0) as f64);
     if let Some(warning) = free.and_then(|free| memory::shortage(need, free)) {
         complain(&warning);
     }

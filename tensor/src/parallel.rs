@@ -87,6 +87,30 @@ pub fn collect<R: Send>(count: usize, f: impl Fn(usize) -> R + Sync) -> Vec<R> {
     results.into_iter().flatten().collect()
 }
 
+/// As [`collect`], but calls run at the same time only if the sum of their `costs` is at most `limit`. A call that costs
+/// more runs alone.
+///
+/// ```
+/// use raygrad_tensor::parallel::collect_within;
+/// let bytes = [400, 700, 300, 2000];
+/// // 400; then 700 and 300; then 2000.
+/// assert_eq!(collect_within(&bytes, 1000, |i| 10 * i), [0, 10, 20, 30]);
+/// ```
+pub fn collect_within<R: Send>(costs: &[u64], limit: u64, f: impl Fn(usize) -> R + Sync) -> Vec<R> {
+    let mut results = Vec::with_capacity(costs.len());
+    while results.len() < costs.len() {
+        let start = results.len();
+        let mut sum = 0_u64;
+        let more = costs[start..].iter().skip(1).take_while(|cost| {
+            sum = sum.saturating_add(**cost);
+            sum.saturating_add(costs[start]) <= limit
+        });
+        let count = 1 + more.count();
+        results.extend(collect(count, |i| f(start + i)));
+    }
+    results
+}
+
 /// Scratch space for the tasks of [`each`]. As many exist as tasks run at once, and later tasks reuse them.
 #[derive(Debug, Default)]
 pub struct Scratch<S>(Mutex<Vec<S>>);

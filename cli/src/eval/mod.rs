@@ -15,12 +15,12 @@ use raygrad::nerf::imaging::lpips::{Backbone, Lpips};
 use raygrad::nerf::imaging::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
 use raygrad::nerf::{
-    Background, Error, Evaluations, Image, Render, Result, fitted_cameras, rename_durable, write_atomic,
+    Background, Error, Evaluations, Image, Render, Result, available_memory, fitted_cameras, rename_durable,
+    write_atomic,
 };
 
 use super::lock::{Lock, State};
 use super::machine::processor;
-use super::memory;
 use super::output::{checksum, complain, depth_colors, make_folder, note, numbered, other_numbered, print, remove};
 use super::parse;
 use super::precision::{Precision, Renderer};
@@ -267,7 +267,7 @@ fn check_seen(backbone: Backbone, data: &Dataset, appearance: Appearance) -> Res
         note(&format!("LPIPS leaves out {masked} of {} images, because they have masks", data.frames.len()));
     }
     let need = largest as f64 * backbone.bytes();
-    if let Some(free) = memory::available().filter(|free| need > *free) {
+    if let Some(free) = available_memory().map(|free| free as f64).filter(|free| need > *free) {
         let [need, free] = [need, free].map(|bytes| bytes / 1e9);
         complain(&format!(
             "warning: LPIPS needs about {need:.1} GB of memory for these images, but {free:.1} GB are free"

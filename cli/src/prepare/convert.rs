@@ -136,7 +136,8 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside:
     let written = Capture { folder: place.folder().into(), views, ..capture.clone() };
     // Written first, so that unsupported features fail before images are copied.
     target.write(&written, place.folder())?;
-    Progress::new().each(jobs.len(), "images written", |i| Ok(jobs[i].run()?))?;
+    let costs: Vec<u64> = jobs.iter().map(|job| job.from.decoding_memory()).collect();
+    Progress::new().each(&costs, "images written", |i| Ok(jobs[i].run()?))?;
     place.finish()?;
     describe(&capture, &jobs, out)?;
     if guessed > 0 {

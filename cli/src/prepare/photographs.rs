@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use raygrad::nerf::dataset::copy_upright;
+use raygrad::nerf::dataset::{Photo, copy_upright};
 use raygrad::nerf::{Error, Result};
 
 use super::root::Root;
@@ -24,10 +24,15 @@ pub fn copy(folder: &Path, found: &[PathBuf], outside: bool, place: &Workplace) 
         found.iter().try_for_each(|path| root.check(path)).map_err(|what| Error::file(folder, what))?;
     }
     let to = place.make("images")?;
-    Progress::new().each(found.len(), "images copied", |i| {
+    Progress::new().each(&decoding_memory(found), "images copied", |i| {
         Ok(copy_upright(&found[i], to.join(found[i].file_name().unwrap_or_default()))?)
     })?;
     Ok(found.len())
+}
+
+/// Bytes of memory while each image is decoded; 0 if its header cannot be read, as decoding reports the error.
+pub fn decoding_memory(images: &[PathBuf]) -> Vec<u64> {
+    images.iter().map(|image| Photo::decoding_memory(image).unwrap_or(0)).collect()
 }
 
 /// Returns true if the file name has one of these extensions.

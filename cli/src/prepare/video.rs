@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::Error;
 use raygrad::nerf::dataset::Photo;
 
+use super::photographs::decoding_memory;
+
 use super::program::{FFMPEG, file_url};
 use super::workplace::Workplace;
 use crate::interrupt::Work;
@@ -86,7 +88,8 @@ impl Video {
 fn keep_sharp(candidates: &[PathBuf], count: usize, to: &Path, progress: &Progress) -> Work<usize> {
     // A short video has fewer candidates, so that groups are smaller.
     let group = ((candidates.len() as f64 / count as f64).round() as usize).clamp(1, CANDIDATES);
-    let sharpness = progress.each(candidates.len(), "frames rated for sharpness", |i| {
+    let costs = decoding_memory(candidates);
+    let sharpness = progress.each(&costs, "frames rated for sharpness", |i| {
         Ok(if group == 1 { 0.0 } else { Photo::open(&candidates[i], None)?.sharpness() })
     })?;
     let mut kept = 0;

@@ -14,7 +14,7 @@ use crate::cameras::{Viewpoint, fitted};
 use crate::photographs::{Photograph, photographs};
 use crate::run::Run;
 use crate::scene::Scene;
-use crate::{builtin, parse};
+use crate::{builtin, memory, parse};
 
 /// Most frames of a video.
 const MOST_FRAMES: usize = 100_000;
@@ -195,7 +195,9 @@ impl CameraPathArgs {
                 (found.map(|(found, camera)| Camera { pose: found.pose, ..camera }).collect(), usual, fps)
             }
         };
-        Ok(CameraMotion { cameras: self.sized(&cameras, usual), fps })
+        let cameras = self.sized(&cameras, usual);
+        memory::check_renders(&cameras)?;
+        Ok(CameraMotion { cameras, fps })
     }
 
     /// The cameras at the size and field of view of the flags. `usual` is the size without flags.

@@ -633,6 +633,13 @@ fn bad_runs_are_named() {
         ),
         (edited("/scene_box/bounds/0/0", json!(9.0)), ["`bounds`", "use finite corners, the lower below the upper"]),
         (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`: is 0; use 1 to 65536"]),
+        (
+            edited(
+                "/viewpoint",
+                json!({ "width": 16_385, "height": 16_384, "angle_x": 1, "distance": 1, "elevation": 0 }),
+            ),
+            ["run/config.json", "`viewpoint.height`: is 16384; use at most 2^28 pixels with `width`"],
+        ),
         (edited("/config/sampler/batch", json!(0)), ["run/config.json", "`batch`"]),
         (edited("/config/field/width", json!(64)), ["run/model.safetensors", "in the file"]),
         (edited("/config/field/depth", json!(3)), ["run/model.safetensors", "another configuration"]),

@@ -2,11 +2,12 @@
 
 use super::formats::npy;
 use super::image::Image;
-use super::photo::decoder_of;
+use super::photo::{Header, decoder_of};
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma};
-use std::io::Cursor;
+use std::fs::File;
+use std::io::{Cursor, Read};
 use std::path::Path;
 
 /// Reads depths along the optical axis in multiples of `unit` scene units: a PNG of integers or a `.npy` array of
@@ -73,6 +74,20 @@ impl Depths {
     /// If it cannot be read or decoded.
     pub fn check_file(path: impl AsRef<Path>) -> Result<()> {
         decoded(path.as_ref()).map(drop)
+    }
+
+    /// The most bytes of memory while a depth file is decoded, from its header.
+    pub(super) fn decoding_memory(path: impl AsRef<Path>) -> Result<u64> {
+        let path = path.as_ref();
+        let bad = |error| Error::file(path, error);
+        let (mut start, mut file) = ([0; npy::MAGIC.len()], File::open(path).map_err(bad)?);
+        if file.read_exact(&mut start).is_ok() && start == npy::MAGIC {
+            // The file, and 8 bytes for each of its 4.
+            return Ok(file.metadata().map_err(bad)?.len().saturating_mul(3));
+        }
+        let header = Header::read(path)?;
+        let [width, height] = header.sizes[0];
+        Ok(header.decoding + 8 * (width * height) as u64)
     }
 
     /// Converts distances along rays, as a [`Render`](crate::Render) has them, to depths, and multiplies them by

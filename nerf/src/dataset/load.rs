@@ -1,23 +1,25 @@
 //! Loading of a capture's images.
 
 use super::capture::{Capture, Format, View};
-use super::depth::distances;
+use super::depth::{Depths, distances};
 use super::formats;
 use super::frames::{Dataset, Frame, Split, evenly_spaced};
+use super::lens_mask::seen_pixels;
 use super::mask::Mask;
-use super::photo::Photo;
+use super::photo::{Header, Photo};
 use super::scene_analysis::SceneAnalysis;
 use super::scene_transform::SceneTransform;
 use super::scene_type::SceneType;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
+use crate::memory::{available_memory, gigabytes};
 use glam::DAffine3;
-use raygrad_tensor::parallel;
+use raygrad_tensor::parallel::{self, locked};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// Without splits in the files, every this many images by name, from the first, is held out.
 const HELD_OUT: usize = 8;
@@ -27,6 +29,8 @@ const LOOKED_AT: usize = 3;
 const CLEAR: f64 = 0.05;
 /// The white share of the border from which an image shows an object in front of white.
 const WHITE_BORDER: f64 = 0.98;
+/// The largest downscale factor that is suggested.
+const MOST_DOWNSCALE: u64 = 1 << 14;
 /// The least mask value of a used pixel.
 pub(super) const WHITE: f32 = 0.99;
 
@@ -39,13 +43,16 @@ pub struct LoadOptions<'a> {
     pub views: usize,
     /// Whether to read [distances](Frame::distances) from [depth files](View::depth), which take four bytes per pixel.
     pub distances: bool,
+    /// The most bytes of memory for images, while they are decoded and afterwards; `None` for the
+    /// [free memory](crate::available_memory).
+    pub memory: Option<u64>,
     /// Progress callback `(read, total)`, in images; called from several threads.
     pub progress: &'a (dyn Fn(usize, usize) + Sync),
 }
 
 impl Default for LoadOptions<'_> {
     fn default() -> Self {
-        LoadOptions { downscale: 1, views: usize::MAX, distances: false, progress: &|_, _| {} }
+        LoadOptions { downscale: 1, views: usize::MAX, distances: false, memory: None, progress: &|_, _| {} }
     }
 }
 
@@ -194,7 +201,8 @@ impl Capture {
     /// # Errors
     /// If none of the split's images exists, an image cannot be decoded or has another aspect ratio than its camera, or
     /// `downscale` or `views` is 0. Which of several errors is reported does not depend on timing. Single absent images
-    /// are not an error: see [`Dataset::skipped`].
+    /// are not an error: see [`Dataset::skipped`]. Before any image is decoded: if all of them together need more than
+    /// [`LoadOptions::memory`].
     pub fn load(&self, split: Split, analysis: &SceneAnalysis, reading: &LoadOptions<'_>) -> Result<Dataset> {
         reading.check()?;
         let (present, absent): (Vec<&View>, Vec<&View>) =
@@ -209,11 +217,13 @@ impl Capture {
         }
         let present = evenly_spaced(present, reading.views);
         // All headers are checked before any image is decoded.
-        let plan = |i: usize| self.named(present[i], Plan::new(self, present[i], reading.downscale));
+        let plan = |i: usize| self.named(present[i], Plan::new(self, present[i], *reading));
         let plans = parallel::collect(present.len(), plan);
         let plans = plans.into_iter().collect::<Result<Vec<_>>>()?;
         let (done, total, lit) = (AtomicUsize::new(0), plans.len(), Lit::default());
-        let frames = parallel::collect(total, |i| {
+        let limit = self.decoding_limit(&plans, reading)?;
+        let costs: Vec<u64> = plans.iter().map(|plan| plan.decoding).collect();
+        let frames = parallel::collect_within(&costs, limit, |i| {
             let frame = plans[i].frame(&analysis.transform, &lit, reading.distances);
             (reading.progress)(done.fetch_add(1, Ordering::Relaxed) + 1, total);
             self.named(plans[i].view, frame)
@@ -230,6 +240,32 @@ impl Capture {
         })
     }
 
+    /// The most bytes for images that are decoded at the same time: what the loaded images leave free.
+    fn decoding_limit(&self, plans: &[Plan<'_>], reading: &LoadOptions<'_>) -> Result<u64> {
+        let Some(free) = reading.memory.or_else(available_memory) else { return Ok(u64::MAX) };
+        let loaded: u64 = plans.iter().map(Plan::loaded).sum();
+        let decoding = plans.iter().map(|plan| plan.decoding).max().unwrap_or(0);
+        if loaded.saturating_add(decoding) <= free {
+            return Ok(free - loaded);
+        }
+        // At least the largest image must be decoded, whatever its final size.
+        let need = |factor: u64| loaded / (factor * factor) + decoding;
+        let fits = (2..=MOST_DOWNSCALE).find(|factor| need(*factor) <= free);
+        let advice = match fits {
+            Some(factor) => {
+                format!("downscale them by {} ({})", factor * reading.downscale as u64, gigabytes(need(factor)))
+            }
+            None => "use smaller images, or fewer".to_owned(),
+        };
+        let what = format!(
+            "{} images need {} of memory, but {} are free: {advice}",
+            plans.len(),
+            gigabytes(need(1)),
+            gigabytes(free)
+        );
+        Err(Error::file(&self.file, what))
+    }
+
     /// Adds the entry of the image in the files to an error.
     fn named<T>(&self, view: &View, result: Result<T>) -> Result<T> {
         result.map_err(|error| Error::field(&self.file, &view.field, error))
@@ -244,19 +280,37 @@ struct Plan<'a> {
     size: [usize; 2],
     /// The size after downscaling.
     to: [usize; 2],
+    /// Bytes of a pixel after it is loaded, with its distance.
+    pixel: u64,
+    /// The most bytes while the image, its mask and its depths are decoded.
+    decoding: u64,
 }
 
 impl<'a> Plan<'a> {
-    fn new(capture: &Capture, view: &'a View, downscale: usize) -> Result<Self> {
+    fn new(
+        capture: &Capture,
+        view: &'a View,
+        LoadOptions { downscale, distances, .. }: LoadOptions<'_>,
+    ) -> Result<Self> {
         let Some(path) = &view.image else { return Err(Error::file(&view.name, "does not exist")) };
         let (path, downscale) = made_smaller(&capture.folder, path, downscale);
-        let size = size_for(&path, &view.camera)?;
+        let header = Header::read(&path)?;
+        let size = fitting(&header, &path, &view.camera)?;
         let to = size.map(|side| ((side as f64 / downscale as f64).round() as usize).max(1));
-        Ok(Plan { view, path, size, to })
+        let mask = view.mask.as_ref().map_or(Ok(0), Photo::decoding_memory)?;
+        let depth = view.depth.as_ref().filter(|_| distances);
+        let pixel = header.pixel + if depth.is_some() { 4 } else { 0 };
+        let depth = depth.map_or(Ok(0), |(path, _)| Depths::decoding_memory(path))?;
+        Ok(Plan { view, path, size, to, pixel, decoding: header.decoding.saturating_add(mask).saturating_add(depth) })
+    }
+
+    /// Bytes of the loaded image.
+    fn loaded(&self) -> u64 {
+        self.pixel.saturating_mul((self.to[0] * self.to[1]) as u64)
     }
 
     fn frame(&self, transform: &SceneTransform, lit: &Lit, is_measured: bool) -> Result<Frame> {
-        let Plan { view, path, size, to } = self;
+        let Plan { view, path, size, to, .. } = self;
         let photo = Photo::open(path, Some(*size))?;
         let image = if [photo.width, photo.height] == *to { photo } else { photo.resized(*to) };
         let camera = view.camera.resized(to[0], to[1]);
@@ -280,11 +334,23 @@ impl<'a> Plan<'a> {
     }
 }
 
+impl View {
+    /// Returns the most bytes of memory while the image and its mask are decoded; without those whose headers cannot be
+    /// read, as decoding reports their errors.
+    pub fn decoding_memory(&self) -> u64 {
+        let files = [&self.image, &self.mask].into_iter().flatten();
+        files.filter_map(|path| Photo::decoding_memory(path).ok()).fold(0, u64::saturating_add)
+    }
+}
+
 /// The size of an image in the orientation of its camera: as stored, or as shown.
 pub(super) fn size_for(path: &Path, camera: &Camera) -> Result<[usize; 2]> {
-    let [stored, shown] = Photo::size_of_file(path)?;
-    [stored, shown].into_iter().find(|size| same_shape(*size, camera)).ok_or_else(|| {
-        let (Camera { width, height, .. }, [w, h]) = (camera, stored);
+    fitting(&Header::read(path)?, path, camera)
+}
+
+fn fitting(header: &Header, path: &Path, camera: &Camera) -> Result<[usize; 2]> {
+    header.sizes.into_iter().find(|size| same_shape(*size, camera)).ok_or_else(|| {
+        let (Camera { width, height, .. }, [w, h]) = (camera, header.sizes[0]);
         let what = format!("has {w}x{h} pixels but its camera {width}x{height}; use one aspect ratio");
         Error::file(path, what)
     })
@@ -352,18 +418,15 @@ impl Lit {
             return None;
         }
         let here = Camera { pose: DAffine3::IDENTITY, ..camera.clone() };
-        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, lit)) = known.iter().find(|(camera, _)| *camera == here) {
-            return lit.clone();
+        let known = |known: &Vec<(Camera, Option<Arc<Mask>>)>| {
+            known.iter().find(|(camera, _)| *camera == here).map(|(_, lit)| lit.clone())
+        };
+        if let Some(lit) = known(&locked(&self.0)) {
+            return lit;
         }
-        let Camera { width, height, .. } = here;
-        let reached = |x: usize, y: usize| here.sees(x as f64 + 0.5, y as f64 + 0.5);
-        let sides = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
-        let mut border = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]).chain(sides);
-        // A lens that sees the whole border sees all pixels inside.
-        let whole = border.all(|(x, y)| reached(x, y));
-        let lit = (!whole).then(|| Arc::new(Mask::new(width, height, reached)));
-        known.push((here, lit.clone()));
+        // Other cameras do not wait. Frames that share a camera may compute its mask twice.
+        let lit = seen_pixels(&here).map(Arc::new);
+        locked(&self.0).push((here, lit.clone()));
         lit
     }
 }

@@ -12,6 +12,7 @@ mod depth;
 pub mod formats;
 mod frames;
 pub(crate) mod image;
+mod lens_mask;
 pub(crate) mod load;
 mod mask;
 pub(crate) mod photo;

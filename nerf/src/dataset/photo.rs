@@ -4,6 +4,7 @@ use super::average::{Stored, average};
 use super::background::over;
 use super::image::Image;
 use crate::error::{Error, Result};
+use crate::memory::{available_memory, gigabytes};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
 use std::fs::File;
@@ -60,10 +61,18 @@ impl Photo {
     ///
     /// # Errors
     /// If the file cannot be read or decoded, or claims more than 2^28 pixels or more than 64 MiB plus 16 KiB per byte
-    /// of the file. The error names it.
+    /// of the file, or needs more memory than is free. The error names it.
     pub fn open(path: impl AsRef<Path>, size: Option<[usize; 2]>) -> Result<Self> {
         let path = path.as_ref();
         let (mut decoder, stored) = decoder(path)?;
+        let need = Header::of(&mut decoder, stored).decoding;
+        if need > LARGE
+            && let Some(free) = available_memory().filter(|free| need > *free)
+        {
+            let [need, free] = [need, free].map(gigabytes);
+            let what = format!("needs {need} of memory to be decoded, but {free} are free: make the image smaller");
+            return Err(Error::file(path, what));
+        }
         let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
         let decoded = DynamicImage::from_decoder(decoder);
         let mut decoded = decoded.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
@@ -91,9 +100,15 @@ impl Photo {
     /// # Errors
     /// If the file cannot be read, is not an image or has more than 2^28 pixels.
     pub fn size_of_file(path: impl AsRef<Path>) -> Result<[[usize; 2]; 2]> {
-        let (mut decoder, stored) = decoder(path.as_ref())?;
-        let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-        Ok([stored, turned_size(stored, turn)])
+        Ok(Header::read(path.as_ref())?.sizes)
+    }
+
+    /// Returns the most bytes of memory while a file is [opened](Self::open), from its header.
+    ///
+    /// # Errors
+    /// As [`size_of_file`](Self::size_of_file).
+    pub fn decoding_memory(path: impl AsRef<Path>) -> Result<u64> {
+        Ok(Header::read(path.as_ref())?.decoding)
     }
 
     /// Reads from its header whether an image file has an alpha channel.
@@ -115,9 +130,9 @@ impl Photo {
         /// The least value of a white channel.
         const WHITE: f32 = 0.97;
         let Photo { width, height, .. } = *self;
-        let border = (0..width * height).map(|i| [i % width, i / width]);
-        let border = border.filter(|[x, y]| *x == 0 || *y == 0 || x + 1 == width || y + 1 == height);
-        let (count, white) = border.fold((0, 0), |(count, white), [x, y]| {
+        let across = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
+        let down = (1..height.saturating_sub(1)).flat_map(|y| [(0, y), (width - 1, y)]);
+        let (count, white) = across.chain(down).fold((0, 0), |(count, white), (x, y)| {
             (count + 1, white + usize::from(self.pixel(x, y)[..3].iter().all(|value| *value >= WHITE)))
         });
         white as f64 / f64::from(count.max(1))
@@ -201,6 +216,32 @@ impl Photo {
     }
 }
 
+/// The header of an image file.
+pub(super) struct Header {
+    /// Width and height as stored, and after the EXIF orientation.
+    pub sizes: [[usize; 2]; 2],
+    /// Bytes of a pixel of the [`Photo`].
+    pub pixel: u64,
+    /// The most bytes of memory while it is decoded: the decoded pixels, and a copy in other channels or turned.
+    pub decoding: u64,
+}
+
+impl Header {
+    pub fn read(path: &Path) -> Result<Self> {
+        let (mut decoder, stored) = decoder(path)?;
+        Ok(Self::of(&mut decoder, stored))
+    }
+
+    fn of(decoder: &mut impl ImageDecoder, stored: [usize; 2]) -> Self {
+        let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+        let color = decoder.color_type();
+        let channels = if color.has_alpha() { 4 } else { 3 };
+        let pixel = channels * if color.bytes_per_pixel() == color.channel_count() { 1 } else { 2 };
+        let copy = pixel * (stored[0] * stored[1]) as u64;
+        Header { sizes: [stored, turned_size(stored, turn)], pixel, decoding: decoder.total_bytes() + copy }
+    }
+}
+
 fn rgba<S: Stored>(pixel: &[S]) -> [f32; 4] {
     let alpha = pixel.get(3).map_or(1.0, |alpha| alpha.unit());
     [pixel[0].unit(), pixel[1].unit(), pixel[2].unit(), alpha]
@@ -226,6 +267,8 @@ fn turned_size([width, height]: [usize; 2], turn: Orientation) -> [usize; 2] {
     }
 }
 
+/// Images whose decoding takes at most this many bytes are decoded whatever memory is free.
+const LARGE: u64 = 1 << 26;
 /// More pixels than any camera has. A file that claims more is damaged, and decoding it would exhaust memory.
 const MOST_PIXELS: usize = 1 << 28;
 /// The most decoded bytes: so many per byte of the file, plus a constant. PNG files of one colour with one bit per

@@ -5,6 +5,7 @@ use crate::dataset::load::same_shape;
 use crate::dataset::photo::sharpness::laplacian_variance;
 use crate::dataset::{Capture, Image, Photo, View};
 use crate::error::Result;
+use crate::memory::available_memory;
 use raygrad_tensor::parallel;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -41,7 +42,8 @@ pub(super) fn look_at_all<'a>(
 ) -> Vec<(&'a View, Result<Look>)> {
     let views: Vec<&View> = capture.present().collect();
     let (done, total) = (AtomicUsize::new(0), views.len());
-    parallel::collect(total, |i| {
+    let costs: Vec<u64> = views.iter().map(|view| view.decoding_memory()).collect();
+    parallel::collect_within(&costs, available_memory().map_or(u64::MAX, |free| free / 2), |i| {
         let look = look_at(views[i]);
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
         (views[i], look)

@@ -4,11 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// The modules in the order of the layers. A module uses none of a later line.
-const ROOMS: [&str; 21] = [
+const ROOMS: [&str; 22] = [
     "error",
     "range",
     "random",
     "files",
+    "memory",
     "numbers",
     "camera",
     "dataset",

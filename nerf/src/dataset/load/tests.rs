@@ -291,3 +291,53 @@ fn unlit_pixels_are_dropped_with_or_without_mask() {
     capture.views.iter_mut().for_each(|view| view.mask = Some(path.clone()));
     check(&capture, Some([5, 3]));
 }
+
+#[test]
+fn images_beyond_the_memory_are_refused_before_decoding() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 9);
+    capture.hold_out();
+    let analysis = capture.analyze_scene(Some(SceneType::Bounded)).unwrap();
+    // A large image in a small file. Most of its pixels are not there, so decoding it would fail.
+    let huge = folder.path().join("images/huge.png");
+    let mut bytes = Image::new(16_384, 16_384, 1).to_png();
+    bytes.truncate(100);
+    bytes.resize(1 << 16, 0);
+    std::fs::write(&huge, bytes).unwrap();
+    for view in capture.views.iter_mut().filter(|view| view.image.is_some()) {
+        view.image = Some(huge.clone());
+        view.camera = Camera::from_angle(24, 24, 0.8, view.camera.pose);
+        view.split = Some(Split::Train);
+    }
+    let load = |memory: u64, downscale: usize| {
+        let options = LoadOptions { memory: Some(memory), downscale, ..LoadOptions::default() };
+        capture.load(Split::Train, &analysis, &options).unwrap_err().to_string()
+    };
+    // 8 images of 2^28 pixels with three bytes, and one decoded with one byte more.
+    let message = load(4_000_000_000, 1);
+    assert!(message.contains("transforms.json: 8 images need 7.5 GB of memory, but 4.0 GB are free"), "{message}");
+    assert!(message.ends_with("downscale them by 2 (2.7 GB)"), "{message}");
+    let message = load(1_100_000_000, 2);
+    assert!(message.contains("need 2.7 GB of memory, but 1.1 GB") && message.ends_with("by 16 (1.1 GB)"), "{message}");
+    assert!(load(500_000_000, 1).ends_with("use smaller images, or fewer"));
+    // With enough memory they are decoded, which fails here.
+    let message = load(1 << 40, 1);
+    assert!(message.contains("huge.png") && message.contains("cannot be decoded"), "{message}");
+}
+
+#[test]
+fn little_memory_loads_the_same_images_in_turns() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 9);
+    capture.hold_out();
+    let analysis = capture.analyze_scene(Some(SceneType::Bounded)).unwrap();
+    let load = |memory: u64| {
+        let options = LoadOptions { memory: Some(memory), ..LoadOptions::default() };
+        capture.load(Split::Train, &analysis, &options)
+    };
+    let all = load(1 << 40).unwrap();
+    // Images of 12 x 8 pixels with 3 bytes, and one decoded with twice as many.
+    let least = (all.frames.len() as u64 + 2) * 3 * 12 * 8;
+    assert_eq!(load(least).unwrap(), all);
+    assert!(load(least - 1).is_err());
+}
