@@ -21,6 +21,7 @@ use super::photographs::{check_trained, present};
 use super::prepare::convert::{Target, convert, relative};
 use super::run::{Run, check_output};
 use super::scene::Scene;
+use super::scratch::ScratchFolder;
 
 /// Export cameras, a mesh, points or a scene page
 ///
@@ -160,7 +161,7 @@ fn write(mut capture: Capture, out: &Path, job: &Job) -> Result<()> {
         view.name = relative(&capture.folder, view)?;
     }
     let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
-    let folder = tempfile::Builder::new().prefix(TEMPORARY_PREFIX).tempdir_in(parent(out)).map_err(bad)?;
+    let folder = ScratchFolder::new(parent(out), TEMPORARY_PREFIX).map_err(bad)?;
     transforms::write(&capture, folder.path())?;
     let text = std::fs::read_to_string(folder.path().join("transforms.json")).map_err(bad)?;
     // An extra field for the mark. Other programs ignore unknown fields.

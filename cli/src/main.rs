@@ -33,6 +33,7 @@ mod reference;
 mod render;
 mod run;
 mod scene;
+mod scratch;
 mod summary;
 mod train;
 mod view;

@@ -14,8 +14,9 @@ use serde_json::Value;
 
 use super::cameras::Viewpoint;
 use super::lock::{Lock, State};
-use super::output::{complain, make_folder, parent, remove};
+use super::output::{make_folder, parent, remove};
 use super::scene::Scene;
+use super::scratch;
 
 /// Default folder of a run. Further runs use `run-2`, `run-3` ...
 const DEFAULT: &str = "run";
@@ -162,26 +163,21 @@ impl Run {
         Ok(true)
     }
 
-    /// Removes temporary files of a killed training, and those of killed videos from the day after on.
+    /// Removes temporary files and folders of killed commands.
     pub fn sweep(&self) {
         let folders = ["", "checkpoints", "previews", "tensorboard", "videos"].map(|name| self.file(name));
-        let entries = folders.into_iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten().flatten();
+        folders.iter().for_each(|folder| scratch::sweep(folder));
+        // Another program may be making a video, so files beside videos stay for a day.
+        let videos = self.file("videos");
         let is_old = |path: &PathBuf| {
             let age = path.symlink_metadata().and_then(|about| about.modified()).map(|time| time.elapsed());
             age.is_ok_and(|age| age.is_ok_and(|age| age > DAY))
         };
-        // Another program may be making a video: folders, and what lies beside videos, stay for a day.
-        let videos = self.file("videos");
-        let is_folder = |path: &PathBuf| path.is_dir() && !path.is_symlink();
-        let is_swept = |path: &PathBuf| is_old(path) || !is_folder(path) && path.parent() != Some(&videos);
-        let unfinished = entries.filter(is_unfinished).map(|entry| entry.path()).filter(is_swept);
-        let (folders, files): (Vec<_>, Vec<_>) = unfinished.partition(is_folder);
-        remove(&files);
-        for folder in folders {
-            if let Err(e) = std::fs::remove_dir_all(&folder) {
-                complain(&format!("{}: cannot be removed: {e}", folder.display()));
-            }
-        }
+        let is_swept =
+            |path: &PathBuf| (!path.is_dir() || path.is_symlink()) && (path.parent() != Some(&videos) || is_old(path));
+        let entries = folders.iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten().flatten();
+        let files = entries.filter(is_unfinished).map(|entry| entry.path()).filter(is_swept);
+        remove(&files.collect::<Vec<_>>());
     }
 
     /// The path of a file of the run.

@@ -4,13 +4,13 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Result};
-use tempfile::TempDir;
 
 use crate::output::complain;
+use crate::scratch::{ScratchFolder, UNFINISHED};
 
 /// A temporary folder on the disk of the output folder. It is removed if it is dropped before [`finish`](Self::finish).
 pub struct Workplace {
-    temporary: TempDir,
+    temporary: ScratchFolder,
     out: PathBuf,
     /// True if the output folder existed and was empty. The temporary folder is then inside it.
     is_inside: bool,
@@ -39,13 +39,8 @@ impl Workplace {
         let name = absolute.file_name().ok_or_else(|| Error::file(out, "is not a valid folder name"))?;
         let folder = if is_inside { &absolute } else { absolute.parent().unwrap_or(&absolute) };
         std::fs::create_dir_all(folder).map_err(bad)?;
-        let mut builder = tempfile::Builder::new();
-        let prefix = format!(".{}{PREFIX}", name.to_string_lossy());
-        // Temporary folders are private by default. This one gets the permissions of an ordinary folder, subject to the
-        // umask.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
-        let temporary = builder.prefix(&prefix).tempdir_in(folder).map_err(bad)?;
+        let prefix = format!(".{}{UNFINISHED}", name.to_string_lossy());
+        let temporary = ScratchFolder::new(folder, &prefix).map_err(bad)?;
         Ok(Workplace { temporary, out: absolute, is_inside })
     }
 
@@ -90,8 +85,6 @@ impl Workplace {
     }
 }
 
-/// Suffix of the temporary folder, after the name of the output folder.
-const PREFIX: &str = "-unfinished-";
 /// Files of empty folders on some systems.
 const NOTHING: [&str; 2] = ["lost+found", ".DS_Store"];
 
@@ -100,7 +93,7 @@ fn others(folder: &Path) -> std::io::Result<Vec<OsString>> {
     let names = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.file_name()));
     let is_other = |name: &OsString| {
         let name = name.to_string_lossy();
-        !(NOTHING.contains(&&*name) || name.starts_with('.') && name.contains(PREFIX))
+        !(NOTHING.contains(&&*name) || name.starts_with('.') && name.contains(UNFINISHED))
     };
     Ok(names.collect::<std::io::Result<Vec<_>>>()?.into_iter().filter(is_other).collect())
 }

@@ -16,6 +16,7 @@ use crate::overwrite::Job;
 use crate::parse::LARGEST;
 use crate::prepare::program::{FFMPEG, file_url};
 use crate::progress::Progress;
+use crate::scratch::ScratchFolder;
 
 /// Largest frame rate of a GIF, with two hundredths of a second per frame. Players slow down faster ones.
 const FASTEST_GIF: f64 = 50.0;
@@ -93,7 +94,7 @@ impl VideoFormat {
     /// Writes the video and replaces the file atomically.
     pub fn write(self, reel: &VideoWriter<'_>, out: &Path) -> Work<()> {
         let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
-        let place = tempfile::Builder::new().prefix(TEMPORARY_PREFIX).tempdir_in(parent(out)).map_err(bad)?;
+        let place = ScratchFolder::new(parent(out), TEMPORARY_PREFIX).map_err(bad)?;
         let file = std::path::absolute(place.path()).map_err(bad)?.join("video");
         let size = reel.size.map(|side| side as u16);
         match self {

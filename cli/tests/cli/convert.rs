@@ -370,3 +370,43 @@ fn built_in_scenes_convert_to_other_formats() {
     place.fails_with("prepare absent --to colmap --size 16 --out other", "absent: there is no such folder");
     assert!(!place.path("other").exists());
 }
+
+/// File names reach messages, pages and the terminal; control characters in them do not.
+#[cfg(unix)]
+#[test]
+fn control_characters_of_names_do_not_reach_the_terminal() {
+    let place = Place::empty();
+    place.succeeds("prepare embedded --size 16 --to llff --out llff");
+    let images = place.path("llff/images");
+    let mut names: Vec<_> = std::fs::read_dir(&images).unwrap().map(|entry| entry.unwrap().path()).collect();
+    names.sort();
+    let evil = "\u{1b}[2J\u{7}<!--<script>.png";
+    std::fs::rename(&names[1], images.join(evil)).unwrap();
+    // The second image is of two pixels, so that errors name it.
+    std::fs::rename(&names[3], images.join("\u{9b}31m\n.png")).unwrap();
+    let run = |arguments: &str| place.command(arguments).output().unwrap();
+    let clean = |arguments: &str| {
+        let output = run(arguments);
+        for text in [&output.stdout, &output.stderr] {
+            let text = String::from_utf8_lossy(text).into_owned();
+            let bad = text.chars().find(|c| c.is_control() && !"\n\t".contains(*c));
+            assert_eq!(bad, None, "{arguments}: {text:?}");
+        }
+        output
+    };
+    assert!(clean("doctor llff --out checked").status.success());
+    let page = std::fs::read_to_string(place.path("checked/doctor.html")).unwrap();
+    assert!(!page.contains("<!--<script>") && !page.contains('\u{1b}'), "the name is escaped in the page");
+    assert!(clean(&format!("train llff --steps 2 --out run {}", super::SMALL)).status.success());
+    assert!(clean("eval run").status.success() && clean("render run --path test --out test").status.success());
+    assert!(clean("prepare llff --to nerfstudio --out other").status.success());
+    // An error about a damaged image names it.
+    std::fs::write(images.join(evil), b"no image").unwrap();
+    for arguments in
+        ["doctor llff --out again", "train llff --steps 1 --out next", "prepare llff --undistort --out last"]
+    {
+        let output = clean(arguments);
+        let said = String::from_utf8([output.stdout, output.stderr].concat()).unwrap();
+        assert!(said.contains("\\u{1b}[2J\\u{7}<!--<script>.png"), "{arguments}: {said}");
+    }
+}

@@ -277,6 +277,39 @@ fn ctrl_c_ends_the_program_and_leaves_nothing() {
 }
 
 #[test]
+fn next_command_removes_what_a_killed_one_left() {
+    let place = place();
+    let killed = |out: &str| {
+        let _ = std::fs::remove_file(place.path("log"));
+        let mut command = command(&place, &format!("prepare photos --out {out}"));
+        command.env("SLEEPS", "mapper").stdout(Stdio::null()).stderr(Stdio::null());
+        let mut child = command.spawn().unwrap();
+        wait(&mut child, || std::fs::read_to_string(place.path("log")).is_ok_and(|log| log.contains("begun")));
+        child
+    };
+    let mut first = killed("made");
+    let left = made(&place);
+    // Another dataset is in the making beside it.
+    let mut other = killed("other");
+    assert_eq!(made(&place).len(), 2, "the first one still works");
+    first.kill().unwrap();
+    first.wait().unwrap();
+    assert_eq!(made(&place).len(), 2, "nothing could remove it");
+    let output = run(&place, "prepare photos --out made");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{said}");
+    assert!(
+        said.contains(&format!("{}: removed ", left[0])) && said.contains(" MB that a killed command left"),
+        "{said}"
+    );
+    let now = made(&place);
+    assert!(now.len() == 2 && !now.contains(&left[0]) && now.iter().any(|name| name == "made"), "{now:?}");
+    assert!(!place.path("made/.raygrad-lock").exists());
+    other.kill().unwrap();
+    other.wait().unwrap();
+}
+
+#[test]
 fn bad_inputs_are_named() {
     let place = place();
     std::fs::create_dir(place.path("empty")).unwrap();
