@@ -41,6 +41,11 @@ impl Events {
         self.0.add(&record(&scalars(now(), step, values)))
     }
 
+    /// Flushes all records to the disk.
+    pub fn flush(&self) -> Result<()> {
+        self.0.flush()
+    }
+
     /// Adds a PNG file of this width and height.
     pub fn image(&mut self, step: u64, name: &str, size: [usize; 2], png: &[u8]) -> Result<()> {
         self.0.add(&record(&image(now(), step, name, size, png)))

@@ -37,6 +37,11 @@ impl Journal {
         self.waiting.clear();
         Ok(())
     }
+
+    /// Flushes the records to the disk.
+    pub fn flush(&self) -> Result<()> {
+        self.file.sync_data().map_err(|e| failed(&self.path, &e))
+    }
 }
 
 fn failed(path: &Path, error: &std::io::Error) -> Error {

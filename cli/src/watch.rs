@@ -174,6 +174,8 @@ impl<'a> Watch<'a> {
         if model {
             trainer.model.save(self.run.model_file())?;
         }
+        // The steps before a checkpoint are not trained again, so their records come first.
+        self.flush();
         self.keep()?;
         checkpoint::save(self.run, trainer)?;
         self.keep()?;
@@ -251,8 +253,15 @@ impl<'a> Watch<'a> {
             self.attempt(|watch| watch.log(&stats));
         }
         let shown = if ended == Ended::Interrupted { Ok(()) } else { self.preview(trainer) };
+        self.flush();
         self.keep()?;
         shown.and(self.summarise(&stats, Some(ended)))
+    }
+
+    /// Flushes the logs to the disk. Failure gives a warning.
+    fn flush(&mut self) {
+        self.attempt(|watch| watch.metrics.flush());
+        self.tell(|events| events.flush());
     }
 
     fn log(&mut self, stats: &StepStats) -> Result<()> {

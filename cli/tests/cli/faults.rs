@@ -26,7 +26,7 @@ fn stride() -> usize {
     if std::env::var("FAULTS").is_ok_and(|which| which == "all") { 1 } else { 31 }
 }
 
-fn has_strace() -> bool {
+pub fn has_strace() -> bool {
     let found = Command::new("strace").arg("-V").output().is_ok_and(|output| output.status.success());
     if !found {
         skipped("strace is not installed");

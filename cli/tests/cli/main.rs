@@ -32,6 +32,8 @@ mod render;
 
 #[cfg(unix)]
 mod faults;
+#[cfg(target_os = "linux")]
+mod power;
 #[cfg(unix)]
 mod records;
 
