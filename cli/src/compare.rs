@@ -7,6 +7,7 @@ use raygrad::nerf::{Error, Result};
 use serde_json::Value;
 
 use super::output::{checksum, complain, entries, print};
+use super::parse::read_text;
 use super::run::Run;
 
 /// Conditions that must be equal for comparable results.
@@ -35,9 +36,6 @@ const MEASURED: [&str; 7] = [
     "color_per_pixel",
     "unskipped_per_pixel",
 ];
-/// Largest result file, in bytes.
-const LONGEST: u64 = 1 << 28;
-
 /// Compare the results of several runs
 ///
 /// Prints one row per result of `raygrad eval`, and below the table what all have in common. Warns where results
@@ -106,14 +104,9 @@ fn results(folder: &Path, only: Option<&str>) -> Result<Vec<PathBuf>> {
 }
 
 /// The fields of a result under dotted names. The views are replaced by their names.
-fn read(path: &Path) -> Result<BTreeMap<String, String>> {
+pub fn read(path: &Path) -> Result<BTreeMap<String, String>> {
     let bad = |what: String| Error::file(path, what);
-    let length = std::fs::metadata(path).map_err(|e| bad(format!("cannot be read: {e}")))?.len();
-    if length > LONGEST {
-        let [own, most] = [length, LONGEST].map(|bytes| bytes >> 20);
-        return Err(bad(format!("not an eval result ({own} MiB; the limit is {most} MiB)")));
-    }
-    let text = std::fs::read_to_string(path).map_err(|e| bad(format!("cannot be read: {e}")))?;
+    let text = read_text(path, "an eval result")?;
     let value: Value = serde_json::from_str(&text).map_err(|e| bad(format!("not an eval result: {e}")))?;
     let Value::Object(all) = value else { return Err(bad("not an eval result: it is not a JSON object".into())) };
     if !all.contains_key("psnr_mean") {
@@ -132,10 +125,14 @@ fn read(path: &Path) -> Result<BTreeMap<String, String>> {
     Ok(fields)
 }
 
+/// Bytes of a dotted name from which its value is shown as a whole. Otherwise long names of many nested values would take
+/// the square of the file's memory.
+const LONG: usize = 200;
+
 /// Adds a value under its name, and nested values under dotted names.
 fn flatten(name: String, value: Value, fields: &mut BTreeMap<String, String>) {
     match value {
-        Value::Object(inner) => {
+        Value::Object(inner) if name.len() < LONG => {
             inner.into_iter().for_each(|(key, value)| flatten(format!("{name}.{key}"), value, fields))
         }
         value => drop(fields.insert(name, shown(&value))),

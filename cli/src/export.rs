@@ -162,7 +162,11 @@ fn write(mut capture: Capture, out: &Path, job: &Job) -> Result<()> {
     }
     let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
     let folder = ScratchFolder::new(parent(out), TEMPORARY_PREFIX).map_err(bad)?;
-    transforms::write(&capture, folder.path())?;
+    // The user knows the file by its own name.
+    transforms::write(&capture, folder.path()).map_err(|error| match error {
+        Error::File { what, .. } => Error::file(out, what),
+        other => other,
+    })?;
     let text = std::fs::read_to_string(folder.path().join("transforms.json")).map_err(bad)?;
     // An extra field for the mark. Other programs ignore unknown fields.
     let text = text.replacen('{', &format!("{{\n  \"exported_by\": \"{}\",", job.mark()), 1);

@@ -4,13 +4,16 @@ use std::path::Path;
 
 use super::cameras::Viewpoint;
 use super::checkpoint;
+use super::compare;
 use super::parse;
+use super::render::frames;
+use super::render::path_file::{self, Motion};
 use super::run::{Run, RunConfig};
 use super::scene::Scene;
 use super::train::changed;
 use super::view::messages::{ClientMessage, Eye, View};
 use proptest::prelude::*;
-use raygrad::nerf::glam::DVec3;
+use raygrad::nerf::glam::{DAffine3, DVec3};
 use raygrad::nerf::{Config, Error, Preset, SceneBox};
 use raygrad_test_support::{
     campaign::campaign,
@@ -164,4 +167,86 @@ fn campaign_checkpoints() {
         clear(result.unwrap_err(), "00000007.checkpoint");
         assert!(taken < 1 << 14, "{length}: {taken} bytes of memory");
     }
+}
+
+/// A parser of a file in a new folder.
+fn from_file<T, E>(name: &str, parse: impl Fn(&Path) -> Result<T, E>) -> impl Fn(&[u8]) -> Result<T, E> {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join(name);
+    move |bytes: &[u8]| {
+        std::fs::write(&file, bytes).unwrap();
+        // The folder lives as long as its parser.
+        assert!(file.starts_with(folder.path()));
+        parse(&file)
+    }
+}
+
+#[test]
+fn campaign_camera_paths() {
+    let pose = [1.0, 0.0, 0.0, 0.5, 0.0, 0.0, -1.0, -4.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
+    let key = json!({ "matrix": pose, "fov": 50.5, "aspect": 1, "override_transition_enabled": true,
+        "override_transition_sec": 1.5 });
+    let frames = json!({ "camera_type": "perspective", "render_height": 48, "render_width": 64, "fps": 24, "seconds": 2.5,
+        "coordinates": "capture", "camera_path": [{ "camera_to_world": pose, "fov": 50.5, "aspect": 1 }, { "camera_to_world": pose, "fov": 60 }] });
+    let keys = json!({ "render_height": 48, "render_width": 64, "coordinates": "capture", "is_cycle": true,
+        "default_transition_sec": 2, "keyframes": [key, key, key] });
+    let ngp = json!({ "loop": true, "time": 0.5, "path": [
+        { "R": [0.1, 0.2, 0.3, 0.9], "T": [0.5, 0.4, 0.3], "fov": 50.5, "dof": 0, "scale": 1, "slice": 0 },
+        { "R": [0.1, 0.2, -0.3, 0.9], "T": [0.5, 0.6, 0.3], "fov": 40, "dof": 0, "scale": 1, "slice": 0 }] });
+    let whole: Vec<Vec<u8>> = [frames, keys, ngp].iter().map(|path| path.to_string().into_bytes()).collect();
+    let parse = from_file("path.json", |file| {
+        let path = path_file::read(file, None, || Ok(DAffine3::IDENTITY))?;
+        let cameras = match path.motion {
+            Motion::Frames(keys) => keys,
+            Motion::Keys { path, .. } => path.frames(5),
+        };
+        for camera in cameras.iter().map(|key| key.camera(path.size.unwrap_or([8, 6]))) {
+            assert!(camera.pose.is_finite() && camera.focal[0] > 0.0 && camera.focal[0].is_finite(), "{camera:?}");
+        }
+        Ok::<(), Error>(())
+    });
+    campaign("camera path", &whole, Bound { times: 64, plus: 1 << 16 }, parse, |error| clear(error, "path.json"));
+}
+
+#[test]
+fn campaign_eval_results() {
+    let long = "a".repeat(300);
+    let whole = [
+        json!({ "psnr_mean": 31.5, "ssim_mean": 0.9, "scene": "x", "model": { "seed": 4, "budget": { "steps": 9 } },
+            "per_view": [{ "name": "b", "psnr": 1 }, { "name": "a" }] }),
+        // Long names of nested values.
+        json!({ "psnr_mean": 3, &*long: { &*long: { "a": 1, "b": 2, "c": 3, "d": 4, "e": 5, "f": 6 } } }),
+    ];
+    let whole = whole.map(|result| result.to_string().into_bytes());
+    let parse = from_file("eval-test.json", |file| compare::read(file).map(drop));
+    campaign("eval result", &whole, Bound { times: 64, plus: 1 << 16 }, parse, |error| clear(error, "eval-test.json"));
+}
+
+#[test]
+fn names_of_nested_values_take_linear_memory() {
+    let mut inner = json!(1);
+    for depth in 0..60 {
+        inner = json!({ format!("{depth:0500}"): inner });
+    }
+    let leaves: serde_json::Map<String, Value> = (0..2000).map(|i| (i.to_string(), json!(0))).collect();
+    let mut deep = Value::Object(leaves);
+    for depth in 0..60 {
+        deep = json!({ format!("{depth:0500}"): deep });
+    }
+    let bytes = json!({ "psnr_mean": 1, "inner": inner, "deep": deep }).to_string();
+    let parse = from_file("eval-test.json", |file| compare::read(file).map(drop));
+    let (result, taken) = peak(|| parse(bytes.as_bytes()));
+    result.unwrap();
+    assert!(taken < 64 * bytes.len(), "{taken} bytes of memory for {}", bytes.len());
+}
+
+#[test]
+fn campaign_records_of_frames() {
+    let of = json!({ "run": "/runs/a", "model": "0a1b2c3d", "frames": 20, "size": [64, 48] });
+    let whole =
+        [json!({ "of": of, "job": "raygrad-render-83a9722", "done": 7, "strange": true }).to_string().into_bytes()];
+    let parse = from_file("unfinished.json", |file| {
+        frames::record(file.parent().unwrap()).map(drop).ok_or_else(|| "another record".to_owned())
+    });
+    campaign("record of frames", &whole, Bound { times: 64, plus: 1 << 16 }, parse, |_| {});
 }

@@ -3,6 +3,7 @@
 use std::fmt::Display;
 use std::ops::Bound::Included;
 use std::ops::{RangeBounds, RangeInclusive};
+use std::path::Path;
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -124,6 +125,30 @@ pub fn weight(text: &str) -> Result<(String, f64), String> {
     let (name, weight) = text.split_once('=').ok_or_else(usage)?;
     let weight = weight.parse().ok().filter(|weight: &f64| weight.is_finite() && *weight >= 0.0).ok_or_else(usage)?;
     Ok((name.to_owned(), weight))
+}
+
+/// Largest text file in bytes. Larger ones are of another kind.
+const LONGEST: u64 = 1 << 28;
+
+/// Reads a text file that should be `kind`, such as `an eval result`.
+///
+/// # Errors
+///
+/// Fails if it cannot be read, is not a regular file, or has more than 256 MiB.
+pub fn read_text(path: &Path, kind: &str) -> raygrad::nerf::Result<String> {
+    let bad = |what: String| Error::file(path, what);
+    let unread = |e: std::io::Error| bad(format!("cannot be read: {e}"));
+    let about = std::fs::metadata(path).map_err(unread)?;
+    let (length, limit) = (about.len(), LONGEST);
+    if length > limit {
+        let [own, most] = [length, limit].map(|bytes| bytes >> 20);
+        return Err(bad(format!("not {kind} ({own} MiB; the limit is {most} MiB)")));
+    }
+    // Devices and pipes may have no end.
+    if !about.is_file() {
+        return Err(bad(format!("not {kind}: it is not a regular file")));
+    }
+    std::fs::read_to_string(path).map_err(unread)
 }
 
 #[cfg(test)]

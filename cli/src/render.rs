@@ -2,8 +2,8 @@
 
 mod animation;
 mod camera_motion;
-mod frames;
-mod path_file;
+pub mod frames;
+pub mod path_file;
 pub mod shown;
 mod video;
 

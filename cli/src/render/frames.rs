@@ -10,6 +10,7 @@ use super::shown::Layer;
 use crate::lock::{Lock, State};
 use crate::output::{complain, make_folder, note, numbered, other_numbered, parent, remove};
 use crate::overwrite::{Job, png_with_text, taken};
+use crate::parse::read_text;
 use crate::run::write_json;
 
 /// Digits of a frame number.
@@ -28,8 +29,8 @@ pub struct Frames {
 }
 
 /// The contents of the record file.
-#[derive(Serialize, Deserialize)]
-struct Record {
+#[derive(Debug, Serialize, Deserialize)]
+pub struct Record {
     /// All inputs of the frames.
     of: Value,
     /// The mark of the job.
@@ -149,8 +150,8 @@ impl Frames {
 }
 
 /// The record of a folder; `None` if it cannot be read.
-fn record(folder: &Path) -> Option<Record> {
-    std::fs::read(folder.join(RECORD)).ok().and_then(|text| serde_json::from_slice(&text).ok())
+pub fn record(folder: &Path) -> Option<Record> {
+    read_text(&folder.join(RECORD), "a record of frames").ok().and_then(|text| serde_json::from_str(&text).ok())
 }
 
 /// The file of a frame's layer.

@@ -20,7 +20,7 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use crate::output::note;
-use crate::parse::{FPS, LARGEST};
+use crate::parse::{FPS, LARGEST, read_text};
 
 /// Most frames and key frames.
 const MOST: usize = 100_000;
@@ -192,7 +192,7 @@ pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Res
 }
 
 fn parse<T: DeserializeOwned>(file: &File) -> Result<T> {
-    let text = std::fs::read_to_string(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")))?;
+    let text = read_text(file, "a camera path")?;
     serde_json::from_str(&text).map_err(|e| Error::file(file, format!("is malformed: {e}")))
 }
 

@@ -35,7 +35,7 @@ pub fn has_strace() -> bool {
 }
 
 /// Runs the program, with a fault if one is given (`CALL:FAULT:when=N`). Returns its output and its calls.
-fn traced(place: &Place, fault: Option<&str>, arguments: &str) -> (Output, Vec<String>) {
+pub fn traced(place: &Place, fault: Option<&str>, arguments: &str) -> (Output, Vec<String>) {
     let log = place.path("strace.log");
     let mut command = Command::new("strace");
     command.current_dir(place.path("")).args(["-f", "-qq", "-y", "-o"]).arg(&log);

@@ -43,6 +43,8 @@ mod resume;
 mod signals;
 #[cfg(unix)]
 mod view;
+#[cfg(target_os = "linux")]
+mod writers;
 
 /// Settings of an instant model whose steps and renders take milliseconds in a debug build.
 const SMALL: &str = "--set field.grid.levels=4 --set field.grid.log2_table=10 --set field.density_width=16 \

@@ -28,7 +28,7 @@ enum Node {
 }
 
 /// The content of a disk: files by path, and folders, which have none.
-type Tree = BTreeMap<PathBuf, Option<Vec<u8>>>;
+pub type Tree = BTreeMap<PathBuf, Option<Vec<u8>>>;
 
 /// A disk on which writes and names last only when they are flushed.
 struct Disk {
@@ -330,7 +330,7 @@ fn is_done(output: &Output) -> bool {
 }
 
 /// The paths at which two trees differ.
-fn differing(a: &Tree, b: &Tree) -> Vec<PathBuf> {
+pub fn differing(a: &Tree, b: &Tree) -> Vec<PathBuf> {
     let paths: std::collections::BTreeSet<_> = a.keys().chain(b.keys()).collect();
     paths.into_iter().filter(|path| a.get(*path) != b.get(*path)).cloned().collect()
 }
@@ -341,7 +341,7 @@ fn below(tree: &Tree, folder: &str) -> Tree {
     inside.map(|(path, bytes)| (path.to_owned(), bytes.clone())).collect()
 }
 
-fn on_disk(place: &Place) -> Tree {
+pub fn on_disk(place: &Place) -> Tree {
     Disk::read(&place.path("").canonicalize().unwrap()).tree(false, None)
 }
 

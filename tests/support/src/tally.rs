@@ -3,6 +3,7 @@
 use super::memory::peak;
 use proptest::prelude::ProptestConfig;
 use std::cell::Cell;
+use std::sync::LazyLock;
 use std::time::Instant;
 
 /// The most bytes that a parser may allocate: some per byte of its file, plus a constant.
@@ -34,21 +35,38 @@ pub struct Tally {
     start: Instant,
     counts: [Cell<u64>; 2],
     peak: Cell<usize>,
+    longest: Cell<f64>,
+}
+
+/// The most seconds of the processor that a parser may take for a file of a test, which has some kilobytes.
+const LONGEST: f64 = 2.0;
+
+/// Seconds that this thread has run; the time where the system does not count them.
+fn worked() -> f64 {
+    static START: LazyLock<Instant> = LazyLock::new(Instant::now);
+    let count = std::fs::read_to_string("/proc/thread-self/schedstat").ok();
+    let nanoseconds = count.and_then(|text| text.split(' ').next()?.parse::<f64>().ok());
+    nanoseconds.map_or_else(|| START.elapsed().as_secs_f64(), |count| 1e-9 * count)
 }
 
 impl Tally {
     /// Starts at 0.
     pub fn new(name: &str) -> Self {
-        Tally { name: name.to_owned(), start: Instant::now(), counts: Default::default(), peak: Cell::new(0) }
+        let (counts, peak, longest) = Default::default();
+        Tally { name: name.to_owned(), start: Instant::now(), counts, peak, longest }
     }
 
-    /// Runs a parser on a file of `length` bytes and checks its memory.
+    /// Runs a parser on a file of `length` bytes and checks its memory and its time.
     pub fn parse<T, E>(&self, length: usize, bound: Bound, parse: impl FnOnce() -> Result<T, E>) -> Result<T, E> {
+        let start = worked();
         let (result, bytes) = peak(parse);
+        let seconds = worked() - start;
+        self.longest.set(seconds.max(self.longest.get()));
         let which = &self.counts[usize::from(result.is_err())];
         which.set(which.get() + 1);
         self.peak.set(self.peak.get().max(bytes));
         assert!(bytes <= bound.of(length), "{}: {bytes} bytes of memory for a file of {length}", self.name);
+        assert!(seconds <= LONGEST, "{}: {seconds} s for a file of {length} bytes", self.name);
         result
     }
 
@@ -63,6 +81,9 @@ impl Drop for Tally {
         let [accepted, refused] = self.counts();
         let (name, seconds, peak) = (&self.name, self.start.elapsed().as_secs_f64(), self.peak.get());
         let inputs = accepted + refused;
-        println!("campaign | {name} | {inputs} inputs | {seconds:.1} s | {accepted} | {refused} | {peak} bytes");
+        let longest = 1e3 * self.longest.get();
+        println!(
+            "campaign | {name} | {inputs} inputs | {seconds:.1} s | {accepted} | {refused} | {peak} bytes | {longest:.1} ms"
+        );
     }
 }

@@ -8,6 +8,7 @@
 #[macro_use]
 mod support;
 
+mod accepted;
 mod activations;
 mod alpha;
 mod color;
