@@ -80,7 +80,7 @@ impl Viewpoint {
                 "viewpoint.height",
                 self.height as f64,
                 self.width.saturating_mul(self.height) <= MOST_PIXELS,
-                "at most 2^28 pixels in all",
+                "at most 2^28 pixels with `width`",
             ),
             (
                 "viewpoint.angle_x",

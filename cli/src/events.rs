@@ -42,7 +42,7 @@ impl Events {
     }
 
     /// Flushes all records to the disk.
-    pub fn flush(&self) -> Result<()> {
+    pub fn flush(&mut self) -> Result<()> {
         self.0.flush()
     }
 

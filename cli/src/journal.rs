@@ -28,6 +28,11 @@ impl Journal {
     /// Appends the waiting records and this one.
     pub fn add(&mut self, record: &[u8]) -> Result<()> {
         self.waiting.extend_from_slice(record);
+        self.append()
+    }
+
+    /// Appends the waiting records.
+    fn append(&mut self) -> Result<()> {
         if let Err(error) = self.file.write_all(&self.waiting) {
             // No further recovery is possible.
             let _ = self.file.set_len(self.length);
@@ -38,8 +43,9 @@ impl Journal {
         Ok(())
     }
 
-    /// Flushes the records to the disk.
-    pub fn flush(&self) -> Result<()> {
+    /// Flushes all records to the disk, waiting ones too.
+    pub fn flush(&mut self) -> Result<()> {
+        self.append()?;
         self.file.sync_data().map_err(|e| failed(&self.path, &e))
     }
 }
@@ -65,6 +71,8 @@ mod tests {
             assert!(message.contains("records: cannot be written"), "{message}");
         }
         journal.file = writable;
+        journal.flush().unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "begin\none\ntwo\nsix\n");
         journal.add(b"ten\n").unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "begin\none\ntwo\nsix\nten\n");
         assert_eq!(journal.length, std::fs::metadata(&path).unwrap().len());

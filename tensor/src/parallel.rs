@@ -268,6 +268,32 @@ mod tests {
     }
 
     #[test]
+    fn collect_within_keeps_the_limit() {
+        use std::sync::atomic::{AtomicU64, Ordering::SeqCst};
+        let costs: Vec<u64> = (0..60).map(|i| [5, 90, 30, 200, 1][i % 5]).collect();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(8).build().unwrap();
+        for limit in [0, 100, 130, u64::MAX] {
+            let (now, most, alone) = (AtomicU64::new(0), AtomicU64::new(0), AtomicU64::new(0));
+            let results = pool.install(|| {
+                super::collect_within(&costs, limit, |i| {
+                    let sum = now.fetch_add(costs[i], SeqCst) + costs[i];
+                    // A call that costs more than the limit runs alone.
+                    let which = if costs[i] > limit { &alone } else { &most };
+                    which.fetch_max(if costs[i] > limit { sum - costs[i] } else { sum }, SeqCst);
+                    std::thread::sleep(std::time::Duration::from_millis(1));
+                    now.fetch_sub(costs[i], SeqCst);
+                    i
+                })
+            });
+            assert_eq!(results, (0..60).collect::<Vec<_>>());
+            let [most, alone] = [most, alone].map(AtomicU64::into_inner);
+            assert!(most <= limit && alone == 0, "{limit}: {most} {alone}");
+            assert!(limit < 130 || most > 91, "{limit}: calls run at the same time: {most}");
+        }
+        assert_eq!(super::collect_within(&[], 1, |i| i), Vec::<usize>::new());
+    }
+
+    #[test]
     fn pieces_are_put_where_they_belong() {
         let (pool, x) = (Pool::new(), values::<f32>(&[1031, 517], 1));
         let at = |i: usize, j: usize| x.as_slice()[i * 517 + j];

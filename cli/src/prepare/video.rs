@@ -88,7 +88,7 @@ impl Video {
 fn keep_sharp(candidates: &[PathBuf], count: usize, to: &Path, progress: &Progress) -> Work<usize> {
     // A short video has fewer candidates, so that groups are smaller.
     let group = ((candidates.len() as f64 / count as f64).round() as usize).clamp(1, CANDIDATES);
-    let costs = decoding_memory(candidates);
+    let costs = if group == 1 { vec![0; candidates.len()] } else { decoding_memory(candidates) };
     let sharpness = progress.each(&costs, "frames rated for sharpness", |i| {
         Ok(if group == 1 { 0.0 } else { Photo::open(&candidates[i], None)?.sharpness() })
     })?;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::{Error, Result};
 
 use crate::output::complain;
-use crate::scratch::{ScratchFolder, UNFINISHED};
+use crate::scratch::{ScratchFolder, UNFINISHED, is_scratch};
 
 /// A temporary folder on the disk of the output folder. It is removed if it is dropped before [`finish`](Self::finish).
 pub struct Workplace {
@@ -72,11 +72,15 @@ impl Workplace {
     /// folder.
     pub fn finish(self) -> Result<()> {
         let Workplace { temporary, out, is_inside } = self;
-        // Disables the removal on drop, so that errors below keep the work.
-        let done = temporary.keep();
-        let moved = if is_inside { move_up(&done, &out) } else { raygrad::nn::rename_durable(&done, &out) };
-        moved.map_err(|e| {
-            if !done.exists() {
+        let moved = match is_inside {
+            true => {
+                let done = temporary.keep();
+                move_up(&done, &out).map_err(|e| (e, done))
+            }
+            false => temporary.rename(&out),
+        };
+        moved.map_err(|(e, done)| {
+            if done == out {
                 return Error::file(&out, format!("is complete, but may not outlast a loss of power: {e}"));
             }
             let done = done.display();
@@ -91,10 +95,7 @@ const NOTHING: [&str; 2] = ["lost+found", ".DS_Store"];
 /// The entries of a folder, except for temporary ones, such as those of a killed program.
 fn others(folder: &Path) -> std::io::Result<Vec<OsString>> {
     let names = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.file_name()));
-    let is_other = |name: &OsString| {
-        let name = name.to_string_lossy();
-        !(NOTHING.contains(&&*name) || name.starts_with('.') && name.contains(UNFINISHED))
-    };
+    let is_other = |name: &OsString| !(NOTHING.iter().any(|nothing| name == *nothing) || is_scratch(name));
     Ok(names.collect::<std::io::Result<Vec<_>>>()?.into_iter().filter(is_other).collect())
 }
 

@@ -102,7 +102,7 @@ fn serve_within(
 }
 
 /// The link to an address. It uses the requested host, or the outward address if the server listens on all addresses.
-/// Browsers send no fragment, so the token reaches neither a proxy nor a log.
+/// Browsers keep the fragment of a page's address to themselves; the page sends the token with its own requests.
 fn link(address: SocketAddr, host: &str, outward: Option<IpAddr>, token: &str) -> String {
     let host = match address.ip() {
         ip if ip.is_loopback() => ip.to_string(),

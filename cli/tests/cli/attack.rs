@@ -1,10 +1,10 @@
 //! The viewer under attack by another user of the machine, and by a page that has the link.
 //!
 //! The attacker is this test program again, as the user "nobody" where the test may change users. In the suite an attack
-//! takes two seconds. This command attacks for a minute and prints the latencies:
+//! takes two seconds. This command attacks for 20 seconds and prints the latencies:
 //!
 //! ```sh
-//! RAYGRAD_ATTACK_SECONDS=60 cargo test --release -p raygrad-cli --test cli attack -- --nocapture --test-threads 1
+//! RAYGRAD_ATTACK_SECONDS=20 cargo test -p raygrad-cli --test cli attack -- --nocapture --test-threads 1
 //! ```
 
 use std::io::{Read, Write};
@@ -157,8 +157,8 @@ impl Latencies {
     }
 }
 
-/// Fails if the owner waits much longer than without the attack. The campaign prints the ratio; machines of tests are
-/// too noisy for it.
+/// Fails if the owner waits much longer than without the attack. The bound is loose, since tests run side by side; the
+/// campaign prints the latencies.
 fn delays_nobody(server: &Server, mut attacked: impl FnMut()) {
     let (mut page, about) = Page::open(server);
     let quiet = Latencies::measure(server, &mut page, &about, length());
@@ -173,8 +173,9 @@ fn delays_nobody(server: &Server, mut attacked: impl FnMut()) {
     let after = Latencies::measure(server, &mut page, &about, length());
     for (when, times) in [("before", &quiet), ("during", &during), ("after", &after)] {
         times.print(when);
-        for times in [&times.renders, &times.pages] {
-            assert!(Latencies::percentiles(times)[1] < 2000.0, "{when}: {times:?}");
+        for (times, quiet) in [(&times.renders, &quiet.renders), (&times.pages, &quiet.pages)] {
+            let [last, quiet] = [times, quiet].map(|times| Latencies::percentiles(times)[1]);
+            assert!(last < 250.0 + 10.0 * quiet, "{when}: {last} ms, and {quiet} ms before");
         }
     }
 }

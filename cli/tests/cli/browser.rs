@@ -95,7 +95,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
     browser.key("c");
     browser.value("document.getElementById('crop').click()");
     browser.rested();
-    assert!(browser.value("marks.querySelectorAll('.camera').length").as_u64().unwrap() >= 10);
+    browser.until("marks.querySelectorAll('.camera').length >= 10");
     browser.key("r");
     browser.rested();
     browser.shot("box");

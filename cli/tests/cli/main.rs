@@ -557,6 +557,37 @@ fn bad_scenes_are_named_and_leave_no_run() {
 }
 
 #[test]
+fn images_beyond_the_free_memory_are_an_error() {
+    let place = Place::empty();
+    // A header of 16384 x 16384 pixels; the rest is not there, and is not needed.
+    let mut bytes = Image::new(1, 1, 3).to_png();
+    bytes[16..24].copy_from_slice(&[0, 0, 64, 0, 0, 0, 64, 0]);
+    let checksum = crc32(&bytes[12..29]).to_be_bytes();
+    bytes[29..33].copy_from_slice(&checksum);
+    bytes.resize(1 << 17, 0);
+    std::fs::write(place.path("huge.png"), bytes).unwrap();
+    let pose = |i: usize| json!([[1, 0, 0, i], [0, 0, -1, -4], [0, 1, 0, 1], [0, 0, 0, 1]]);
+    let frame = |i: usize| json!({ "file_path": "huge.png", "transform_matrix": pose(i) });
+    let frames: Vec<Value> = (0..20_000).map(frame).collect();
+    let names = vec!["huge.png"; 1];
+    let scene = json!({ "camera_angle_x": 0.7, "w": 64, "h": 64, "frames": frames, "train_filenames": names });
+    std::fs::write(place.path("transforms.json"), scene.to_string()).unwrap();
+    // 16 TB.
+    place.fails(
+        "train . --steps 1 --out run",
+        &["transforms.json: 20000 images need 16106.9 GB of memory, but ", " GB are free: a downscale of "],
+    );
+    assert!(!place.path("run").exists());
+}
+
+/// The CRC-32 of PNG and zlib.
+fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(u32::MAX, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte), |crc, _| if crc & 1 == 1 { (crc >> 1) ^ 0xedb8_8320 } else { crc >> 1 })
+    })
+}
+
+#[test]
 fn absent_images_are_skipped_with_a_warning() {
     let place = Place::with_scene();
     std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();

@@ -249,11 +249,11 @@ impl Capture {
             return Ok(free - loaded);
         }
         // At least the largest image must be decoded, whatever its final size.
-        let need = |factor: u64| loaded / (factor * factor) + decoding;
+        let need = |factor: u64| (loaded / (factor * factor)).saturating_add(decoding);
         let fits = (2..=MOST_DOWNSCALE).find(|factor| need(*factor) <= free);
         let advice = match fits {
             Some(factor) => {
-                format!("downscale them by {} ({})", factor * reading.downscale as u64, gigabytes(need(factor)))
+                format!("a downscale of {} needs {}", factor * reading.downscale as u64, gigabytes(need(factor)))
             }
             None => "use smaller images, or fewer".to_owned(),
         };
@@ -301,6 +301,9 @@ impl<'a> Plan<'a> {
         let depth = view.depth.as_ref().filter(|_| distances);
         let pixel = header.pixel + if depth.is_some() { 4 } else { 0 };
         let depth = depth.map_or(Ok(0), |(path, _)| Depths::decoding_memory(path))?;
+        // Masks have a bit and a share of a count per pixel; that of a lens has a byte while it is computed.
+        let is_masked = view.mask.is_some() || view.camera.lens != Lens::Pinhole;
+        let pixel = pixel + u64::from(is_masked);
         Ok(Plan { view, path, size, to, pixel, decoding: header.decoding.saturating_add(mask).saturating_add(depth) })
     }
 
@@ -335,11 +338,12 @@ impl<'a> Plan<'a> {
 }
 
 impl View {
-    /// Returns the most bytes of memory while the image and its mask are decoded; without those whose headers cannot be
-    /// read, as decoding reports their errors.
+    /// Returns the most bytes of memory while the image, its mask and its depths are decoded; without those whose
+    /// headers cannot be read, as decoding reports their errors.
     pub fn decoding_memory(&self) -> u64 {
-        let files = [&self.image, &self.mask].into_iter().flatten();
-        files.filter_map(|path| Photo::decoding_memory(path).ok()).fold(0, u64::saturating_add)
+        let files = [&self.image, &self.mask].into_iter().flatten().map(Photo::decoding_memory);
+        let depths = self.depth.iter().map(|(path, _)| Depths::decoding_memory(path));
+        files.chain(depths).flatten().fold(0, u64::saturating_add)
     }
 }
 

@@ -8,7 +8,7 @@ use crate::memory::{available_memory, gigabytes};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
+use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
 mod resample;
@@ -64,15 +64,7 @@ impl Photo {
     /// of the file, or needs more memory than is free. The error names it.
     pub fn open(path: impl AsRef<Path>, size: Option<[usize; 2]>) -> Result<Self> {
         let path = path.as_ref();
-        let (mut decoder, stored) = decoder(path)?;
-        let need = Header::of(&mut decoder, stored).decoding;
-        if need > LARGE
-            && let Some(free) = available_memory().filter(|free| need > *free)
-        {
-            let [need, free] = [need, free].map(gigabytes);
-            let what = format!("needs {need} of memory to be decoded, but {free} are free: make the image smaller");
-            return Err(Error::file(path, what));
-        }
+        let (mut decoder, stored) = decoder_within_memory(path)?;
         let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
         let decoded = DynamicImage::from_decoder(decoder);
         let mut decoded = decoded.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
@@ -222,24 +214,74 @@ pub(super) struct Header {
     pub sizes: [[usize; 2]; 2],
     /// Bytes of a pixel of the [`Photo`].
     pub pixel: u64,
-    /// The most bytes of memory while it is decoded: the decoded pixels, and a copy in other channels or turned.
+    /// The most bytes of memory while it is decoded.
     pub decoding: u64,
 }
 
 impl Header {
     pub fn read(path: &Path) -> Result<Self> {
+        let (start, length) = start_of(path)?;
+        // The decoder of JPEG reads its input to the end; the header is at its start.
+        if start.starts_with(JPEG)
+            && let Ok((mut decoder, stored)) = decoder_of(Cursor::new(&start), length, path)
+        {
+            return Ok(Self::of(&mut decoder, stored, &start, length));
+        }
         let (mut decoder, stored) = decoder(path)?;
-        Ok(Self::of(&mut decoder, stored))
+        Ok(Self::of(&mut decoder, stored, &start, length))
     }
 
-    fn of(decoder: &mut impl ImageDecoder, stored: [usize; 2]) -> Self {
+    fn of(decoder: &mut impl ImageDecoder, stored: [usize; 2], start: &[u8], length: u64) -> Self {
         let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-        let color = decoder.color_type();
+        let (color, pixels) = (decoder.color_type(), (stored[0] * stored[1]) as u64);
         let channels = if color.has_alpha() { 4 } else { 3 };
         let pixel = channels * if color.bytes_per_pixel() == color.channel_count() { 1 } else { 2 };
-        let copy = pixel * (stored[0] * stored[1]) as u64;
-        Header { sizes: [stored, turned_size(stored, turn)], pixel, decoding: decoder.total_bytes() + copy }
+        let decoded = decoder.total_bytes();
+        // A copy in other channels, and one that is turned; both formats hold pixels as the photo does if they agree.
+        let converted = if u64::from(color.bytes_per_pixel()) == pixel { 0 } else { pixel * pixels };
+        let turned = if turn == Orientation::NoTransforms { 0 } else { decoded };
+        // What decoders hold beside: the file, and coefficients or planes.
+        let inner = match start {
+            start if is_progressive(start) => length + 2 * channels * pixels,
+            start if start.starts_with(JPEG) => length,
+            [b'R', b'I', b'F', b'F', ..] => length + 4 * pixels,
+            _ => 0,
+        };
+        let decoding = decoded + converted.max(turned).max(inner);
+        Header { sizes: [stored, turned_size(stored, turn)], pixel, decoding }
     }
+}
+
+/// The first bytes of a JPEG file.
+const JPEG: &[u8] = b"\xff\xd8\xff";
+/// The bytes that are read of a JPEG for its header. If EXIF and colour profiles take more, all of it is read.
+const START: u64 = 1 << 18;
+
+/// The first bytes of a file, and its length.
+fn start_of(path: &Path) -> Result<(Vec<u8>, u64)> {
+    let bad = |e: std::io::Error| Error::file(path, format!("cannot be read: {e}"));
+    let file = File::open(path).map_err(bad)?;
+    let (mut start, length) = (vec![], file.metadata().map_err(bad)?.len());
+    file.take(START).read_to_end(&mut start).map_err(bad)?;
+    Ok((start, length))
+}
+
+/// Returns true for a progressive JPEG, by the marker of its frame: its decoder holds all coefficients.
+fn is_progressive(start: &[u8]) -> bool {
+    if !start.starts_with(JPEG) {
+        return false;
+    }
+    let mut at = 2;
+    while let Some(&[0xff, marker, high, low]) = start.get(at..at + 4) {
+        match marker {
+            // Frames with progressive coding.
+            0xc2 | 0xc6 | 0xca | 0xce => return true,
+            // Other frames, and the start of the pixels.
+            0xc0 | 0xc1 | 0xda => return false,
+            _ => at += 2 + usize::from(u16::from_be_bytes([high, low])),
+        }
+    }
+    false
 }
 
 fn rgba<S: Stored>(pixel: &[S]) -> [f32; 4] {
@@ -275,11 +317,31 @@ const MOST_PIXELS: usize = 1 << 28;
 /// pixel reach half of the former; damaged headers can claim any size.
 const MOST_BYTES: [u64; 2] = [1 << 14, 1 << 26];
 
+/// The most bytes of a file.
+const LONGEST: u64 = 1 << 31;
+
+/// [`decoder`], if decoding needs no more memory than is free.
+fn decoder_within_memory(path: &Path) -> Result<(impl ImageDecoder, [usize; 2])> {
+    let need = Header::read(path)?.decoding;
+    match available_memory() {
+        Some(free) if need > LARGE && need > free => {
+            let [need, free] = [need, free].map(gigabytes);
+            let what = format!("needs {need} of memory to be decoded, but {free} are free: make the image smaller");
+            Err(Error::file(path, what))
+        }
+        _ => decoder(path),
+    }
+}
+
 /// The decoder of a file, and the stored size of its pixels.
 fn decoder(path: &Path) -> Result<(impl ImageDecoder, [usize; 2])> {
     let bad = |e: std::io::Error| Error::file(path, format!("cannot be read: {e}"));
     let file = File::open(path).map_err(bad)?;
     let length = file.metadata().map_err(bad)?.len();
+    if length > LONGEST {
+        let [own, limit] = [length, LONGEST].map(gigabytes);
+        return Err(Error::file(path, format!("has {own}; the limit for an image is {limit}")));
+    }
     decoder_of(BufReader::new(file), length, path)
 }
 

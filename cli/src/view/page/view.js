@@ -39,7 +39,7 @@ function withToken(path) {
 /** True if the server refuses the token. Browsers do not tell why a socket fails. */
 async function isRefused() {
   try {
-    return (await fetch(withToken("access"))).status === 403;
+    return (await fetch(withToken("access"), { signal: AbortSignal.timeout(3000) })).status === 403;
   } catch {
     return false;
   }
@@ -53,17 +53,18 @@ function connect() {
   socket.onopen = () => { attempts = 0; $("lost").hidden = true; unseen = null; };
   socket.onmessage = (event) => (typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data));
   socket.onclose = async (event) => {
-    const refused = !event.reason && await isRefused();
-    // A new link may have opened another socket.
+    // A new link has opened another socket.
     if (socket !== own) return;
-    $("lost").textContent = refused ? "This link does not open the viewer. Open the link that raygrad printed last."
-      : training && training.ended ? "Training has ended and raygrad has exited. Open the run with raygrad view."
+    $("lost").textContent = training && training.ended ? "Training has ended and raygrad has exited. Open the run with raygrad view."
       : event.reason ? `raygrad closed the connection: ${event.reason}. Reconnecting…`
       : "raygrad does not respond. Reconnecting…";
     $("lost").hidden = false;
-    if (refused) return;
     attempts += 1;
-    setTimeout(() => { if (socket === own) connect(); }, Math.min(5000, 250 * 2 ** attempts));
+    const again = setTimeout(() => { if (socket === own) connect(); }, Math.min(5000, 250 * 2 ** attempts));
+    if (!event.reason && await isRefused()) {
+      clearTimeout(again);
+      $("lost").textContent = "This link does not open the viewer. Open the link that raygrad printed last.";
+    }
   };
 }
 

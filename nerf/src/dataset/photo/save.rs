@@ -1,6 +1,6 @@
 //! Writing of images to files.
 
-use super::{Photo, Values, decoder};
+use super::{Photo, Values, decoder_within_memory};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use image::codecs::jpeg::JpegEncoder;
@@ -58,7 +58,7 @@ impl Photo {
 pub fn copy_upright(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> {
     let (from, to) = (from.as_ref(), to.as_ref());
     let bad = |e: ImageError| Error::file(from, format!("cannot be decoded: {e}"));
-    let (mut decoder, _) = decoder(from)?;
+    let (mut decoder, _) = decoder_within_memory(from)?;
     let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     if turn == Orientation::NoTransforms {
         DynamicImage::from_decoder(decoder).map_err(bad)?;
@@ -156,7 +156,7 @@ mod tests {
                 Photo::open(&to, None).unwrap().resized([1, 2]),
                 Photo::open(&from, None).unwrap().resized([1, 2])
             );
-            let (mut decoder, _) = decoder(&to).unwrap();
+            let (mut decoder, _) = decoder_within_memory(&to).unwrap();
             assert_eq!(decoder.exif_metadata().unwrap(), Some(exif(1)));
             assert_eq!(decoder.icc_profile().unwrap(), Some(vec![7; 300]));
         }

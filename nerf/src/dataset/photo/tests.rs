@@ -54,7 +54,7 @@ fn resizing_does_not_enlarge() {
 fn jpeg(orientation: u8) -> Vec<u8> {
     let mut plain = vec![];
     let picture = image::RgbImage::from_fn(16, 8, |x, y| image::Rgb([if x < 8 && y < 4 { 255 } else { 0 }; 3]));
-    picture.write_to(&mut std::io::Cursor::new(&mut plain), ImageFormat::Jpeg).unwrap();
+    picture.write_to(&mut Cursor::new(&mut plain), ImageFormat::Jpeg).unwrap();
     // An APP1 segment with a directory of one entry: tag 0x0112, a short.
     let mut exif = b"\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
     exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
@@ -139,4 +139,56 @@ proptest! {
         prop_assert_eq!([small.width, small.height], to);
         prop_assert!((mean(&small) - mean(&photo)).abs() < 1e-6);
     }
+}
+
+#[test]
+fn decoding_takes_at_most_the_announced_memory() {
+    use raygrad_test_support::memory::peak;
+    let folder = tempfile::tempdir().unwrap();
+    let (width, height) = (300, 200);
+    let noise = |i: usize| ((i * 2_654_435_761) >> 7) as u8;
+    let grey = image::GrayImage::from_vec(width, height, (0..60_000).map(noise).collect()).unwrap();
+    let grey = DynamicImage::ImageLuma8(grey);
+    let all = [
+        ("grey.png", grey.clone()),
+        ("rgb.png", DynamicImage::ImageRgb8(grey.to_rgb8())),
+        ("rgba.png", DynamicImage::ImageRgba8(grey.to_rgba8())),
+        ("deep.png", DynamicImage::ImageRgba16(grey.to_rgba16())),
+        ("grey16.png", DynamicImage::ImageLuma16(grey.to_luma16())),
+        ("rgb.jpg", DynamicImage::ImageRgb8(grey.to_rgb8())),
+        ("rgb.webp", DynamicImage::ImageRgb8(grey.to_rgb8())),
+    ];
+    for (name, image) in all {
+        let path = folder.path().join(name);
+        image.save(&path).unwrap();
+        let announced = Photo::decoding_memory(&path).unwrap();
+        let (photo, taken) = peak(|| Photo::open(&path, None).unwrap());
+        // Buffers of the decoders come in addition.
+        let buffers = 1 << 19;
+        assert!(taken as u64 <= announced + buffers, "{name}: {taken} of {announced}");
+        assert!(announced <= 4 * photo.bytes() as u64 + 200_000, "{name}: {announced} for {}", photo.bytes());
+        let header = Header::read(&path).unwrap();
+        assert_eq!(header.pixel * 60_000, photo.bytes() as u64, "{name}");
+    }
+}
+
+#[test]
+fn header_of_jpeg_is_read_from_its_start() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("long.jpg");
+    let mut bytes = jpeg(6);
+    bytes.resize(3 << 20, 0);
+    std::fs::write(&path, &bytes).unwrap();
+    let (sizes, taken) = raygrad_test_support::memory::peak(|| Photo::size_of_file(&path).unwrap());
+    assert_eq!(sizes, [[16, 8], [8, 16]]);
+    assert!(taken < 5 << 19, "{taken} bytes for the header");
+    // A file without an end is refused before it is read.
+    File::options().write(true).open(&path).unwrap().set_len(3 << 30).unwrap();
+    let error = Photo::open(&path, None).unwrap_err().to_string();
+    assert!(error.contains("long.jpg: has 3.2 GB; the limit for an image is 2.1 GB"), "{error}");
+    // The marker of the frame, after segments of any length.
+    let segments =
+        |frame: u8| [&[0xff, 0xd8, 0xff, 0xe1, 0, 4, 1, 2, 0xff, frame, 0, 4, 0, 0][..], &[0xff, 0xda, 0, 2]].concat();
+    assert_eq!([0xc0, 0xc1, 0xc2, 0xca].map(|frame| is_progressive(&segments(frame))), [false, false, true, true]);
+    assert!(!is_progressive(b"\x89PNG") && !is_progressive(&segments(0xc2)[..8]));
 }
