@@ -57,15 +57,15 @@ impl ScratchFolder {
     ///
     /// Fails with the path at which the folder then is.
     pub fn rename(self, to: &Path) -> std::result::Result<(), (std::io::Error, PathBuf)> {
-        let from = self.folder.path().to_owned();
-        match raygrad::nn::rename_durable(&from, to) {
-            Err(error) if from.exists() => Err((error, self.keep())),
-            moved => {
-                let _ = self.folder.keep();
-                let _ = remove_file(to.join(LOCK));
-                moved.map_err(|error| (error, to.to_owned()))
-            }
-        }
+        let ScratchFolder { lock, folder } = self;
+        let from = folder.keep();
+        // Windows renames no folder with an open file.
+        let lock = (!cfg!(windows)).then_some(lock);
+        let moved = raygrad::nn::rename_durable(&from, to);
+        let at = if from.exists() { from } else { to.to_owned() };
+        let _ = remove_file(at.join(LOCK));
+        drop(lock);
+        moved.map_err(|error| (error, at))
     }
 
     /// Makes the folder an ordinary one, which nobody removes.

@@ -54,7 +54,9 @@ pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
     let inner = folder.join("images");
     for folder in [folder, &inner] {
         let Ok(entries) = std::fs::read_dir(folder) else { continue };
-        let files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(|path| path.is_file()).collect();
+        // Hidden files, such as the `._` twins of macOS, are no images.
+        let shown = entries.flatten().filter(|entry| !entry.file_name().as_encoded_bytes().starts_with(b"."));
+        let files: Vec<PathBuf> = shown.map(|entry| entry.path()).filter(|path| path.is_file()).collect();
         let others = files.iter().filter(|path| ends(path, &NOT_READ)).count();
         let found: Vec<PathBuf> = files.into_iter().filter(|path| ends(path, &READ)).collect();
         if others > 0 {

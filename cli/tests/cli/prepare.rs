@@ -187,6 +187,10 @@ fn video_becomes_a_dataset_of_sharp_frames() {
 fn images_become_an_upright_dataset() {
     let place = place();
     std::fs::write(place.path("photos/notes.txt"), "").unwrap();
+    // What macOS puts beside images.
+    for name in ["._0.JPG", ".DS_Store", ".hidden.png"] {
+        std::fs::write(place.path(&format!("photos/{name}")), "no image").unwrap();
+    }
     // Stored in landscape, shown in portrait: the size differs, so each image has its own camera.
     std::fs::write(place.path("photos/turned.jpg"), jpeg(4, 6)).unwrap();
     let said = succeeds(&place, "prepare photos --out made --lens fisheye");

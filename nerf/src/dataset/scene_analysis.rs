@@ -102,7 +102,8 @@ impl SceneAnalysis {
         let depths: Vec<[f64; 2]> = capture.present().filter_map(|view| view.bounds).collect();
         let points = trusted(&capture.points);
         let Layout { middle, inner, looks } = Layout::new(&cameras, &depths, &points);
-        let reason = format!("{reason}; {looks}");
+        let sideways = if is_sideways(&cameras) { "; all images are on their side" } else { "" };
+        let reason = format!("{reason}; {looks}{sideways}");
         let distance = median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
         if !(distance > 1e-9 * (1.0 + middle.length())) {
             let what = "has all cameras in one place, so the scene has no scale; check the positions of the poses";
@@ -237,13 +238,34 @@ fn ahead(cameras: &[&Camera], depths: &[[f64; 2]]) -> DVec3 {
     }))
 }
 
-/// A rotation that turns up to z. People hold cameras level, so up is perpendicular to the horizontal axes of all
-/// (their least principal axis), on the side of the cameras' up axes.
+/// The least length of the mean of axes that are nearly parallel.
+const PARALLEL: f64 = 0.7;
+/// By how much it must exceed that of the other axes.
+const MORE_PARALLEL: f64 = 0.05;
+
+/// Returns true if the images lie on their side, such as portraits that are stored in landscape: their x axes are nearly
+/// parallel, and more so than their y axes.
+///
+/// That is never so for cameras with level x axes and one pitch: the mean of their y axes is at least as long.
+fn is_sideways(cameras: &[&Camera]) -> bool {
+    let [x, y] = [|pose: &DAffine3| pose.matrix3.x_axis, |pose: &DAffine3| pose.matrix3.y_axis]
+        .map(|axis| average(cameras, axis).length());
+    x > PARALLEL && y < x - MORE_PARALLEL
+}
+
+/// A rotation that turns up to z. People hold cameras level or on their side, so up is perpendicular to the horizontal
+/// axes of all (their least principal axis). It is on the side of the cameras' up axes. Of images on their side, it is on
+/// the side from which the cameras look down, or else to the left, as phones store portraits.
 fn upright(cameras: &[&Camera]) -> DMat3 {
-    let mean = average(cameras, |pose| pose.matrix3.y_axis);
+    let is_sideways = is_sideways(cameras);
+    let mean = match is_sideways {
+        true => -average(cameras, |pose| pose.matrix3.x_axis),
+        false => average(cameras, |pose| pose.matrix3.y_axis),
+    };
     let mut spread = DMat3::from_diagonal(DVec3::splat(1e-4));
     for camera in cameras {
-        spread += outer(camera.pose.matrix3.x_axis) * (1.0 / cameras.len() as f64);
+        let axes = &camera.pose.matrix3;
+        spread += outer(if is_sideways { axes.y_axis } else { axes.x_axis }) * (1.0 / cameras.len() as f64);
     }
     let inverse = spread.inverse();
     let mut up = if mean.length() > 1e-3 { mean.normalize() } else { DVec3::Z };
@@ -255,7 +277,9 @@ fn upright(cameras: &[&Camera]) -> DMat3 {
     }
     // Cameras that look straight down have no common up axis; the direction opposite to their views is up.
     let back = average(cameras, |pose| pose.matrix3.z_axis);
-    let side = if up.dot(mean).abs() > 0.1 { up.dot(mean) } else { up.dot(back) };
+    let sides = [up.dot(mean), up.dot(back)];
+    let [first, second] = if is_sideways { [sides[1], sides[0]] } else { sides };
+    let side = if first.abs() > 0.1 { first } else { second };
     let up = if side < 0.0 { -up } else { up };
     // The shortest rotation leaves an upright capture unchanged.
     DMat3::from_quat(glam::DQuat::from_rotation_arc(up, DVec3::Z))

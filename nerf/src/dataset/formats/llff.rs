@@ -113,7 +113,11 @@ fn images(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
     Err(Error::file(folder.join("images"), what))
 }
 
+/// Returns true for the name of an image. Hidden files, such as the `._` twins of macOS, are none.
 fn is_image(name: &str) -> bool {
+    if name.starts_with('.') {
+        return false;
+    }
     let extension = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
     EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
 }

@@ -146,6 +146,44 @@ fn forward_walk_is_not_forward_facing() {
     assert!(analysis.reason.starts_with("images are opaque, so they show a background; "), "{}", analysis.reason);
 }
 
+/// The cameras, turned about their optical axes: images on their side, as phones store portraits.
+fn rolled(cameras: &[Camera], degrees: f64) -> Vec<Camera> {
+    let turn = DMat3::from_rotation_z(degrees.to_radians());
+    let roll = |camera: &Camera| {
+        let pose = DAffine3 { matrix3: camera.pose.matrix3 * turn, ..camera.pose };
+        Camera { pose, ..camera.clone() }
+    };
+    cameras.iter().map(roll).collect()
+}
+
+#[test]
+fn up_of_images_on_their_side_is_that_of_upright_ones() {
+    let orbit = |pitch: f64, arc: f64| {
+        let eye = move |i: usize| {
+            let (sin, cos) = (arc * i as f64 / 12.0).sin_cos();
+            CENTRE + 4.0 * DVec3::new(pitch.cos() * cos, pitch.cos() * sin, pitch.sin())
+        };
+        (0..12).map(|i| camera(eye(i), CENTRE, DVec3::Z)).collect::<Vec<_>>()
+    };
+    let analyse = |cameras| SceneAnalysis::new(&capture(Format::Colmap, cameras), None, None).unwrap();
+    let up = |cameras| analyse(cameras).transform.rotation.transpose() * DVec3::Z;
+    for (pitch, arc) in [(0.3, 6.2), (0.6, 6.2), (0.4, 3.1), (0.2, 2.2)] {
+        let upright = orbit(pitch, arc);
+        for degrees in [0.0, 90.0, -90.0] {
+            let cameras = rolled(&upright, degrees);
+            assert!(up(cameras.clone()).distance(DVec3::Z) < 0.02, "{pitch} {arc} {degrees}: {}", up(cameras));
+        }
+        let is_said =
+            |degrees: f64| analyse(rolled(&upright, degrees)).reason.ends_with("; all images are on their side");
+        assert_eq!([0.0, 90.0, -90.0].map(is_said), [false, true, true]);
+    }
+    // Level cameras tell no side, so that of phones counts: up is on the left.
+    let level = orbit(0.0, 6.2);
+    assert!(up(rolled(&level, -90.0)).distance(DVec3::Z) < 0.02 && up(rolled(&level, 90.0)).distance(-DVec3::Z) < 0.02);
+    // Cameras that all look the same way have no axis that is more parallel.
+    assert!(!analyse(quarter(4.0)).reason.contains("side"));
+}
+
 #[test]
 fn downward_cameras_have_up_behind_them() {
     // Two strips of a flight; the second is flown back, so the cameras have no common up axis.

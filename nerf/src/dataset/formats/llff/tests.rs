@@ -38,7 +38,7 @@ fn folder(bytes: &[u8], images: &[&str]) -> tempfile::TempDir {
 }
 
 /// The images of two rows, and entries that are not images.
-const IMAGES: [&str; 4] = ["images/b.JPG", "images/a.png", "images/notes.txt", "images/c.png/x"];
+const IMAGES: [&str; 5] = ["images/b.JPG", "images/a.png", "images/notes.txt", "images/c.png/x", "images/._a.png"];
 
 #[test]
 fn llff_rows_follow_image_names() {
