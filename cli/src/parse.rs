@@ -197,6 +197,24 @@ mod tests {
         }
     }
 
+    #[cfg(unix)]
+    #[test]
+    fn read_text_refuses_devices_and_large_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("path.json");
+        std::fs::write(&file, "{}").unwrap();
+        assert_eq!(read_text(&file, "a camera path").unwrap(), "{}");
+        std::fs::write(&file, [0xff]).unwrap();
+        assert!(read_text(&file, "a camera path").unwrap_err().to_string().contains("path.json: cannot be read"));
+        std::fs::File::create(&file).unwrap().set_len((1 << 28) + 1).unwrap();
+        let expected = format!("{}: not a camera path (256 MiB; the limit is 256 MiB)", file.display());
+        assert_eq!(read_text(&file, "a camera path").unwrap_err().to_string(), expected);
+        for endless in ["/dev/zero", "/dev"] {
+            let expected = format!("{endless}: not a camera path: it is not a regular file");
+            assert_eq!(read_text(Path::new(endless), "a camera path").unwrap_err().to_string(), expected);
+        }
+    }
+
     #[test]
     fn size_parses_or_refuses() {
         assert_eq!(size("400x300"), Ok([400, 300]));

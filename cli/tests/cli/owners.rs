@@ -76,7 +76,9 @@ fn training_stops_if_its_folder_is_replaced() {
         let before = contents(&place, "run");
         lost("the first training", ended(first));
         assert_same(&place, "whole", "run");
-        assert!(contents(&place, "run") == before, "a file of the second training has changed");
+        // A file being written at that moment is completed.
+        let changed: Vec<_> = contents(&place, "run").into_iter().filter(|file| !before.contains(file)).collect();
+        assert!(changed.len() <= 1, "{:?}", changed.iter().map(|(path, _)| path).collect::<Vec<_>>());
         if moves {
             place.succeeds("train --resume moved --steps 1");
             std::fs::remove_dir_all(place.path("moved")).unwrap();

@@ -352,7 +352,7 @@ fn power_loss_keeps_a_run() {
     if !has_strace() {
         return;
     }
-    let train = format!("train scene --steps 12 --checkpoint-every 0.001s --out run {SMALL}");
+    let train = format!("train scene --steps 12 --checkpoint-every 0.001s --tensorboard --out run {SMALL}");
     let whole = Place::with_scene();
     whole.succeeds(&format!("--threads 1 {train}"));
     let place = Place::with_scene();

@@ -234,6 +234,7 @@ fn messages_need_the_token() {
         let (link, requests) = served_at(host, Limits::USUAL);
         let (address, token) = parts(&link);
         assert!(token.len() == 32 && token.bytes().all(|byte| byte.is_ascii_hexdigit()), "{token}");
+        assert!(!token.contains("00000000"), "all of it is random: {token}");
         let address = format!("127.0.0.1:{}", address.rsplit(':').next().unwrap());
         let status = |path: &str| request(&address, &format!("GET {path} HTTP/1.1\r\nHost: {address}")).0;
         // The files hold no data of the scene.
