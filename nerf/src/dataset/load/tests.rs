@@ -344,3 +344,29 @@ fn little_memory_loads_the_same_images_in_turns() {
     assert_eq!(load(least).unwrap(), all);
     assert!(load(least - 1).is_err());
 }
+
+#[test]
+fn plan_counts_the_mask_and_the_depths() {
+    let folder = tempfile::tempdir().unwrap();
+    let capture = capture(folder.path(), 1);
+    let mut view = capture.views[0].clone();
+    let plan = |view: &View, distances: bool| {
+        let plan = Plan::new(&capture, view, LoadOptions { distances, ..LoadOptions::default() }).unwrap();
+        (plan.decoding, plan.loaded())
+    };
+    let pixels = 12 * 8;
+    assert_eq!(plan(&view, true), (3 * pixels, 3 * pixels));
+    // A grey mask is converted to RGB.
+    let [mask, depth] = ["mask.png", "depth.npy"].map(|name| folder.path().join(name));
+    std::fs::write(&mask, Image::new(24, 16, 1).to_png()).unwrap();
+    view.mask = Some(mask);
+    let masked = 3 * pixels + 4 * 24 * 16;
+    assert_eq!(plan(&view, true), (masked, 4 * pixels));
+    // Depths are the file and twice as much in f64.
+    let header = b"\x93NUMPY".to_vec();
+    std::fs::write(&depth, [header, vec![0; 1000]].concat()).unwrap();
+    view.depth = Some((depth, 1.0));
+    assert_eq!(plan(&view, false), (masked, 4 * pixels));
+    assert_eq!(plan(&view, true), (masked + 3 * 1006, 8 * pixels));
+    assert_eq!(view.decoding_memory(), masked + 3 * 1006);
+}
