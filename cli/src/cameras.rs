@@ -7,6 +7,8 @@ use raygrad::nerf::dataset::Dataset;
 use raygrad::nerf::{Camera, Error, Result, SceneBox};
 use serde::{Deserialize, Serialize};
 
+use super::memory::MOST_PIXELS;
+
 /// The average training camera, which allows orbits without the images.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -46,9 +48,6 @@ const FROM_CENTRE: f64 = 0.02;
 
 /// Largest side of a training image in pixels. Larger values come from damaged files.
 const LARGEST: usize = 1 << 16;
-
-/// Most pixels of a training image, as of every image.
-const MOST_PIXELS: usize = 1 << 28;
 
 impl Viewpoint {
     /// The average of a dataset's cameras. The dataset is not empty.

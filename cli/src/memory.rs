@@ -1,4 +1,4 @@
-//! Estimates of the memory for training.
+//! Estimates of the memory for training and renders.
 
 use raygrad::nerf::dataset::{Dataset, Frame};
 use raygrad::nerf::{BatchSize, Camera, Error, Result, Trainer, available_memory};
@@ -17,7 +17,7 @@ const SAMPLE: f64 = 3300.0;
 /// Bytes per pixel of a render, with its encoded file.
 const RENDERED: f64 = 40.0;
 /// Most pixels of a render.
-const MOST_PIXELS: usize = LARGEST * LARGEST;
+pub const MOST_PIXELS: usize = LARGEST * LARGEST;
 
 /// Estimated bytes of training, images included. `docs/benchmarks/results.md` has the measured values.
 pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {

@@ -139,9 +139,8 @@ pub fn read_text(path: &Path, kind: &str) -> raygrad::nerf::Result<String> {
     let bad = |what: String| Error::file(path, what);
     let unread = |e: std::io::Error| bad(format!("cannot be read: {e}"));
     let about = std::fs::metadata(path).map_err(unread)?;
-    let (length, limit) = (about.len(), LONGEST);
-    if length > limit {
-        let [own, most] = [length, limit].map(|bytes| bytes >> 20);
+    if about.len() > LONGEST {
+        let [own, most] = [about.len(), LONGEST].map(|bytes| bytes >> 20);
         return Err(bad(format!("not {kind} ({own} MiB; the limit is {most} MiB)")));
     }
     // Devices and pipes may have no end.

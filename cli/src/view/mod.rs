@@ -71,7 +71,7 @@ pub struct Args {
 pub struct PlaceArgs {
     /// Address to serve on
     ///
-    /// 127.0.0.1 serves this machine only. The link holds a token and gives access to everyone who has it.
+    /// 127.0.0.1 serves this machine only. The link holds a token, which gives access.
     /// The connection is not encrypted.
     #[arg(long, help_heading = "Viewer", default_value = HOST)]
     host: String,

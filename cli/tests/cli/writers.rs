@@ -1,7 +1,7 @@
 //! Every command that writes, with faults of the disk at its output.
 //!
-//! `WRITERS=all cargo test --test cli writers -- --nocapture` injects each fault at each call and prints the table; the
-//! suite injects some of them.
+//! `WRITERS=all cargo test --test cli writers -- --nocapture` injects each fault at up to twelve calls and prints the
+//! table; the suite injects some of them once.
 
 use super::faults::{has_strace, traced};
 use super::power::{Tree, differing, on_disk};
@@ -88,7 +88,7 @@ fn writers_keep_old_results_on_faults() {
     let place = Place::with_scene();
     place.succeeds(&format!("--threads 1 train scene --steps 12 --out run {SMALL}"));
     let root = place.path("").canonicalize().unwrap();
-    let at = root.to_str().unwrap();
+    let here = root.to_str().unwrap();
     for (number, Writer { command, result: name, is_gradual }) in WRITERS.into_iter().enumerate() {
         // It takes seconds.
         let is_slow = command.starts_with("bench");
@@ -118,7 +118,7 @@ fn writers_keep_old_results_on_faults() {
         for (kind, (call, fault, what)) in FAULTS.into_iter().enumerate() {
             let of_kind = calls.iter().filter(|line| line.starts_with(&format!("{call}(")));
             let numbers: Vec<usize> =
-                of_kind.enumerate().filter(|(_, line)| is_about(line, at, name)).map(|(i, _)| i + 1).collect();
+                of_kind.enumerate().filter(|(_, line)| is_about(line, here, name)).map(|(i, _)| i + 1).collect();
             if numbers.is_empty() || !all && (number + kind) % 3 != 0 {
                 continue;
             }
@@ -136,7 +136,7 @@ fn writers_keep_old_results_on_faults() {
                 let more = if (turn % 2 == 0) == (call != "write") { "+" } else { "" };
                 let (output, calls) = traced(&place, Some(&format!("{call}:{fault}:when={at}{more}")), &threaded);
                 // This time a command may have fewer calls, or another one may be at this number.
-                let hit = calls.iter().any(|call| call.contains("(INJECTED)") && is_about(call, at_root(&root), name));
+                let hit = calls.iter().any(|call| call.contains("(INJECTED)") && is_about(call, here, name));
                 let said = String::from_utf8_lossy(&output.stderr).into_owned();
                 let case = format!("{command}: {call} {fault} at {at}{more}: {said}");
                 assert!(!said.contains("panicked"), "{case}");
@@ -154,7 +154,7 @@ fn writers_keep_old_results_on_faults() {
                     code => panic!("{case} {code:?}"),
                 }
                 if words.is_empty() {
-                    words = line.replace(at_root(&root), "").to_owned();
+                    words = line.replace(here, "");
                 }
                 let now = on_disk(&place);
                 let [new, old_result] = [&now, &old].map(|tree| result(tree, name));
@@ -197,11 +197,6 @@ fn writers_keep_old_results_on_faults() {
             place.command(&threaded).output().unwrap();
         }
     }
-}
-
-/// The root as the start of a message's path.
-fn at_root(root: &Path) -> &str {
-    root.to_str().unwrap()
 }
 
 /// Temporary files and locks, and files that name jobs and times.

@@ -9,10 +9,8 @@ use raygrad::nerf::dataset::formats::colmap::{self, Encoding};
 use raygrad::nerf::dataset::formats::{blender, llff, transforms};
 use raygrad::nerf::dataset::{Capture, Image, LoadOptions, Split};
 use raygrad::nerf::doctor::{DoctorOptions, examine};
-use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
-use raygrad::nerf::space::occupancy::OccupancyConfig;
-use raygrad::nerf::{Background, Camera, Config, InstantConfig, Preset, Trainer};
+use raygrad::nerf::{Background, Camera, Config, Trainer};
 use raygrad_test_support::damage::{clear, damage, damaged};
 use std::path::Path;
 use std::sync::Arc;
@@ -43,13 +41,8 @@ fn nerfstudio(folder: &Path) {
 
 /// A model whose steps take milliseconds.
 fn config() -> Config {
-    let mut config = Config::preset(Preset::Instant);
-    if let Some(field) = config.field.get_mut::<InstantConfig>() {
-        field.grid = HashGridConfig { levels: 2, features: 2, log2_table: 6, coarsest: 3, finest: 8 };
-        (field.density_width, field.features, field.color_width, field.direction_degree) = (6, 4, 5, 2);
-    }
+    let mut config = super::fuzz::config();
     if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
-        sampler.occupancy = OccupancyConfig { resolution: 4, ..sampler.occupancy };
         (sampler.samples, sampler.step, sampler.view_step) = (256, 0.1, 0.1);
     }
     config

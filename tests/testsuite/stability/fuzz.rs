@@ -36,7 +36,8 @@ fn scene(folder: &Path) -> Vec<u8> {
     text.as_bytes().to_vec()
 }
 
-fn config() -> Config {
+/// A model whose steps take milliseconds.
+pub fn config() -> Config {
     let mut config = Config::preset(Preset::Instant);
     if let Some(field) = config.field.get_mut::<InstantConfig>() {
         field.grid = HashGridConfig { levels: 2, features: 2, log2_table: 6, coarsest: 3, finest: 8 };
