@@ -105,6 +105,7 @@ pub fn run(args: &Args) -> Work<()> {
             let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
             let scene = Scene::from(args.input.clone().into_os_string());
             let capture = builtin::capture(&scene, args.size, Some(pictures.path()))?;
+            doctor::assumptions(&capture);
             let to = to.unwrap_or_else(|| Target::of(capture.format));
             convert::convert(capture, to, undistort, args.allow_outside, &args.out)?;
         }

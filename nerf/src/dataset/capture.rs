@@ -52,13 +52,25 @@ pub struct Capture {
     /// The transform that was applied to the original (COLMAP) coordinates: nerfstudio's `applied_transform` and
     /// `applied_scale`. The identity if not given.
     pub applied: DAffine3,
+    /// Assumptions of the reader where the files are unclear, one sentence each without a full stop; callers should
+    /// report them.
+    pub assumptions: Vec<String>,
 }
 
 impl Capture {
     /// Creates a capture of these images, without points.
     pub fn new(folder: &Path, file: PathBuf, format: Format, views: Vec<View>) -> Self {
-        let (points, points_file, aabb_scale, applied) = (vec![], None, None, DAffine3::IDENTITY);
-        Capture { folder: folder.to_owned(), file, format, views, points, points_file, aabb_scale, applied }
+        Capture {
+            folder: folder.to_owned(),
+            file,
+            format,
+            views,
+            points: vec![],
+            points_file: None,
+            aabb_scale: None,
+            applied: DAffine3::IDENTITY,
+            assumptions: vec![],
+        }
     }
 }
 

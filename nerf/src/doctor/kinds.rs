@@ -206,6 +206,10 @@ kinds! {
     OnALine = "on-a-line", Warning,
         "all cameras stand on one line, so edges along it have no depth",
         "Capture from above and below that line too.";
+    /// The reader of the capture made an assumption.
+    Assumption = "assumption", Note,
+        "{}",
+        "Nothing to do if this is right. Otherwise correct the files of the capture.";
 }
 
 impl FindingKind {

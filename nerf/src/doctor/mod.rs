@@ -67,6 +67,9 @@ pub fn examine(capture: &Capture, analysis: Option<&SceneAnalysis>, options: &Do
 fn without_pixels(capture: &Capture, analysis: Option<&SceneAnalysis>, findings: &mut Findings) -> Facts {
     let absent: Vec<&View> = capture.views.iter().filter(|view| view.image.is_none()).collect();
     let all = absent.len() == capture.views.len();
+    for assumption in &capture.assumptions {
+        findings.add(FindingKind::Assumption, &[assumption]);
+    }
     if let Some(finding) = findings.about(FindingKind::ImagesAbsent, absent, &[&capture.views.len()])
         && all
     {
