@@ -204,7 +204,7 @@ fn write_failures_do_not_end_a_run() {
     place.succeeds(&format!("train scene --steps 150 --out whole {SMALL}"));
     let arguments = format!("train scene --steps 150 --out run --checkpoint-every 0.01s {SMALL}");
     let lost_its_folder = || {
-        let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut child = place.command(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let begun = || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0);
         super::wait(&mut child, begun);
         // Repeatedly, since the program recreates it for each checkpoint.
@@ -218,7 +218,8 @@ fn write_failures_do_not_end_a_run() {
     let said = String::from_utf8(output.stderr).unwrap();
     let is_said = ["training continues", "training continues in a new folder"].iter().any(|words| said.contains(words));
     assert!(output.status.success() && is_said, "{said}");
-    assert!(place.bytes("run/model.safetensors") == place.bytes("whole/model.safetensors"));
+    let is_same = place.bytes("run/model.safetensors") == place.bytes("whole/model.safetensors");
+    assert!(is_same, "{said}{}{}", String::from_utf8_lossy(&output.stdout), place.json("run/summary.json"));
     place.succeeds("eval run --views 1");
 }
 

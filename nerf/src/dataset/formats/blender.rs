@@ -4,7 +4,7 @@
 //! Camera fields of [`transforms`](super::transforms) count here too, except `camera_angle_y`, which is that of
 //! Blender's sensor.
 
-use super::frames::{Dialect, views};
+use super::frames::{Dialect, Frames};
 use super::json::{self, Object};
 use super::{matrix, paths};
 use crate::camera::lens::Lens;
@@ -40,29 +40,30 @@ pub(crate) fn detect(folder: &Path) -> bool {
 /// # Errors
 /// If there is no file, or one cannot be read, lacks a field, or has a field that is wrong or unsupported.
 pub fn read(folder: &Path) -> Result<Capture> {
-    let mut capture: Option<Capture> = None;
+    let mut documents = vec![];
     for split in Split::ALL {
         let file = file_of(folder, split);
-        if !file.is_file() {
-            continue;
-        }
-        let document = json::read(&file)?;
-        let top = Object::top(&file, &document)?;
-        let mut views = views(&top, folder, Dialect::Blender)?;
-        views.iter_mut().for_each(|view| view.split = Some(split));
-        let aabb_scale = top.positive("aabb_scale")?;
-        match &mut capture {
-            Some(capture) => {
-                views.iter_mut().for_each(|view| view.field = format!("{} {}", name_of(split), view.field));
-                capture.views.append(&mut views);
-                capture.aabb_scale = capture.aabb_scale.or(aabb_scale);
-            }
-            None => capture = Some(Capture { aabb_scale, ..Capture::new(folder, file, Format::Blender, views) }),
+        if file.is_file() {
+            documents.push((split, json::read(&file)?, file));
         }
     }
-    let what = "is not a Blender dataset: expected transforms_train.json, transforms_val.json or \
-                transforms_test.json";
-    capture.ok_or_else(|| Error::file(folder, what))
+    let Some((_, _, first)) = documents.first() else {
+        let what = "is not a Blender dataset: expected transforms_train.json, transforms_val.json or \
+                    transforms_test.json";
+        return Err(Error::file(folder, what));
+    };
+    let tops = documents.iter().map(|(_, document, file)| Object::top(file, document)).collect::<Result<Vec<_>>>()?;
+    let Frames { mut views, assumptions, .. } = Frames::read(&tops, folder, Dialect::Blender)?;
+    let mut aabb_scale = None;
+    for (i, ((split, ..), views)) in documents.iter().zip(&mut views).enumerate() {
+        views.iter_mut().for_each(|view| view.split = Some(*split));
+        if i > 0 {
+            views.iter_mut().for_each(|view| view.field = format!("{} {}", name_of(*split), view.field));
+        }
+        aabb_scale = aabb_scale.or(tops[i].positive("aabb_scale")?);
+    }
+    let views = views.into_iter().flatten().collect();
+    Ok(Capture { aabb_scale, assumptions, ..Capture::new(folder, first.clone(), Format::Blender, views) })
 }
 
 /// Writes a file for each split that has views, or `transforms_train.json` if no view has a split.

@@ -60,7 +60,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
     // Models with known cameras may have no points.
     let points = if points.is_file() { Some(content(points)?) } else { None };
     let mut capture = parse(folder, encoding, &files, [&content(cameras)?, &content(images)?], points.as_deref())?;
-    beside::attach(&mut capture, &model);
+    beside::attach(&mut capture, &model)?;
     Ok(capture)
 }
 
@@ -112,20 +112,41 @@ fn parse(
     if images.is_empty() {
         return Err(Error::field(images_file, "images", "is empty: add at least one image"));
     }
-    let cameras: HashMap<u32, Camera> = cameras.into_iter().map(|entry| (entry.id, entry.camera)).collect();
-    let view = |entry: ImageEntry| {
-        let ImageEntry { place, pose, name, camera: id, .. } = entry;
-        let Some(camera) = cameras.get(&id) else {
-            let what = format!("is {id}, but {} has no camera with this id", cameras_file.display());
-            return Err(place.error(images_file, "camera_id", what));
-        };
-        Ok(View::new(name, place.name(), Camera { pose, ..camera.clone() }))
-    };
-    let mut views = images.into_iter().map(view).collect::<Result<Vec<View>>>()?;
+    let cameras: HashMap<u32, Result<Camera>> = cameras.into_iter().map(|entry| (entry.id, entry.camera)).collect();
+    let (mut views, mut left_out, mut error) = (vec![], vec![], None);
+    for ImageEntry { place, pose, name, camera: id, .. } in images {
+        match (pose, cameras.get(&id)) {
+            (_, None) => {
+                let what = format!("is {id}, but {} has no camera with this id", cameras_file.display());
+                return Err(place.error(images_file, "camera_id", what));
+            }
+            (Ok(pose), Some(Ok(camera))) => {
+                views.push(View::new(name, place.name(), Camera { pose, ..camera.clone() }))
+            }
+            (pose, _) => {
+                error = error.or(pose.err());
+                left_out.push(name);
+            }
+        }
+    }
+    let mut errors: Vec<(u32, Error)> =
+        cameras.into_iter().filter_map(|(id, camera)| Some((id, camera.err()?))).collect();
+    errors.sort_by_key(|(id, _)| *id);
+    let error = error.or_else(|| errors.into_iter().next().map(|(_, error)| error));
+    let mut assumptions = vec![];
+    if let (Some(name), Some(error)) = (left_out.first(), error) {
+        // A model that is mostly wrong makes a bad scene.
+        if views.len() <= left_out.len() {
+            return Err(error);
+        }
+        let (count, total) = (left_out.len(), left_out.len() + views.len());
+        assumptions
+            .push(format!("left out {count} of {total} images without a valid camera, such as `{name}`: {error}"));
+    }
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let points_file = Some(points_file.clone()).filter(|_| !points.is_empty());
     let capture = Capture::new(folder, images_file.clone(), Format::Colmap, views);
-    Ok(Capture { points, points_file, ..capture })
+    Ok(Capture { points, points_file, assumptions, ..capture })
 }
 
 /// Checks that no two entries of a list have the same key.

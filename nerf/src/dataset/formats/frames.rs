@@ -3,10 +3,12 @@
 use super::intrinsics::check_known;
 use super::json::Object;
 use super::layers::Layers;
+use super::locate::{Located, locate};
 use super::{matrix, paths};
 use crate::dataset::capture::View;
 use crate::dataset::photo::Photo;
 use crate::error::{Error, Result};
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 /// The unit of integer depth images in nerfstudio: a millimetre in scenes in metres.
@@ -21,79 +23,164 @@ pub(super) enum Dialect {
     Blender,
 }
 
-/// All frames, in the order of the file. No image is decoded; headers are read if the file gives no size.
-pub(super) fn views(top: &Object<'_>, folder: &Path, dialect: Dialect) -> Result<Vec<View>> {
-    check_known(top)?;
-    let frames = top.frames()?;
-    let mut places = Vec::with_capacity(frames.len());
-    for frame in &frames {
-        let name = paths::normal(frame, "file_path", frame.required("file_path")?)?;
-        let image = paths::find(folder, &name);
-        places.push((name, image));
-    }
-    let first = frames.iter().zip(&places).find_map(|(frame, (_, image))| Some((frame, image.as_deref()?)));
-    let mut common = None;
-    let mut views = Vec::with_capacity(frames.len());
-    for (frame, (name, image)) in frames.iter().zip(&places) {
-        check_known(frame)?;
-        let pose = matrix::pose(frame, "transform_matrix")?;
-        let header = || {
-            // An absent image is assumed to be as large as the first.
-            let own = image.as_deref().filter(|_| dialect == Dialect::Transforms).map(|image| (frame, image));
-            match (own, first) {
-                (Some(own), _) => size(own),
-                (None, Some(first)) => common.map_or_else(|| size(first), Ok).inspect(|size| common = Some(*size)),
-                (None, None) => Ok([0, 0]),
+/// The frames of one capture, in one or several documents.
+#[derive(Debug, Default)]
+pub(super) struct Frames {
+    /// The views of each document, in the order of its frames.
+    pub(super) views: Vec<Vec<View>>,
+    /// Names of frames without a finite pose, which were left out.
+    pub(super) left_out: HashSet<String>,
+    /// The error of the first of them.
+    error: Option<Error>,
+    /// Sentences about files found elsewhere, and frames left out.
+    pub(super) assumptions: Vec<String>,
+}
+
+impl Frames {
+    /// Reads the frames of the documents. No image is decoded; headers are read if a document gives no size.
+    pub(super) fn read(tops: &[Object<'_>], folder: &Path, dialect: Dialect) -> Result<Self> {
+        let mut out = Frames::default();
+        let mut frames = vec![];
+        for top in tops {
+            check_known(top)?;
+            frames.push(top.frames()?);
+        }
+        let all: Vec<&Object<'_>> = frames.iter().flatten().collect();
+        for frame in &all {
+            frame.required("file_path")?;
+        }
+        let mut images = files(&all, "file_path", folder, &mut out.assumptions)?.into_iter();
+        for (top, frames) in tops.iter().zip(&frames) {
+            let images: Vec<_> = images.by_ref().take(frames.len()).flatten().collect();
+            let views = out.document(top, frames, &images, folder, dialect)?;
+            out.views.push(views);
+        }
+        if let Some(name) = out.left_out.iter().min() {
+            // Images that are mostly left out make a bad scene.
+            if let Some(error) = out.error.take().filter(|_| 2 * out.left_out.len() >= all.len()) {
+                return Err(error);
             }
-        };
-        let camera = Layers { top, frame }.camera(pose, header, dialect == Dialect::Transforms)?;
-        views.push(View {
-            image: image.clone(),
-            mask: beside(frame, folder, "mask_path", image.is_some())?,
-            depth: depth(top, frame, folder, image.is_some())?,
-            sharpness: frame.number("sharpness")?,
-            ..View::new(name, &frame.path, camera)
-        });
+            let (count, total) = (out.left_out.len(), all.len());
+            out.assumptions.push(format!("left out {count} of {total} frames without a finite pose, such as `{name}`"));
+        }
+        Ok(out)
     }
-    Ok(views)
+
+    fn document(
+        &mut self,
+        top: &Object<'_>,
+        frames: &[Object<'_>],
+        images: &[Named],
+        folder: &Path,
+        dialect: Dialect,
+    ) -> Result<Vec<View>> {
+        let layers: Vec<Layers<'_, '_>> = frames.iter().map(|frame| Layers { top, frame }).collect();
+        let all: Vec<&Object<'_>> = frames.iter().collect();
+        let masks = files(&all, "mask_path", folder, &mut self.assumptions)?;
+        let depths = Depths::of(top, &all, folder, &mut self.assumptions)?;
+        let first = frames.iter().zip(images).find_map(|(frame, (_, image))| Some((frame, image.as_ref()?)));
+        let mut common = None;
+        let mut views = Vec::with_capacity(frames.len());
+        for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
+            check_known(frame)?;
+            let pose = match matrix::pose(frame, "transform_matrix")? {
+                Ok(pose) => pose,
+                Err(error) => {
+                    self.error.get_or_insert(error);
+                    self.left_out.insert(name.clone());
+                    continue;
+                }
+            };
+            let header = || {
+                // An absent image is assumed to be as large as the first.
+                let own = image.as_ref().filter(|_| dialect == Dialect::Transforms).map(|image| (frame, image));
+                match (own, first) {
+                    (Some(own), _) => size(own),
+                    (None, Some(first)) => common.map_or_else(|| size(first), Ok).inspect(|size| common = Some(*size)),
+                    (None, None) => Ok([0, 0]),
+                }
+            };
+            let camera = layers[i].camera(pose, header, dialect == Dialect::Transforms)?;
+            views.push(View {
+                image: image.as_ref().map(|image| image.path.clone()),
+                mask: needed(frame, "mask_path", &masks[i], image.is_some())?,
+                depth: depths.of_frame(i, &layers[i], image.is_some())?,
+                sharpness: frame.number("sharpness")?,
+                ..View::new(name, &frame.path, camera)
+            });
+        }
+        Ok(views)
+    }
+}
+
+/// A listed path and its file, if it exists.
+type Named = (String, Option<Located>);
+
+/// The files of one member of each frame; `None` for frames without it.
+fn files(
+    frames: &[&Object<'_>],
+    member: &str,
+    folder: &Path,
+    assumptions: &mut Vec<String>,
+) -> Result<Vec<Option<Named>>> {
+    let name = |frame: &&Object<'_>| frame.get(member).map(|value| paths::normal(frame, member, value)).transpose();
+    let names = frames.iter().map(name).collect::<Result<Vec<Option<String>>>>()?;
+    let listed: Vec<usize> = (0..frames.len()).filter(|&i| names[i].is_some()).collect();
+    let found = locate(folder, &names.iter().flatten().map(String::as_str).collect::<Vec<_>>(), assumptions);
+    let mut found = found.map_err(|(i, what)| frames[listed[i]].error(member, what))?.into_iter();
+    Ok(names.into_iter().map(|name| Some((name?, found.next().flatten()))).collect())
 }
 
 /// The size of a frame's image, from its header.
-fn size((frame, image): (&Object<'_>, &Path)) -> Result<[usize; 2]> {
-    Photo::size_of_file(image).map(|[_, shown]| shown).map_err(|e| match e {
+fn size((frame, image): (&Object<'_>, &Located)) -> Result<[usize; 2]> {
+    Photo::size_of_file(&image.path).map(|[_, shown]| shown.map(|side| side * image.factor)).map_err(|e| match e {
         Error::File { path, what } => frame.error("file_path", format!("{}: {what}", path.display())),
         other => other,
     })
 }
 
-/// A file that accompanies an image. It must exist if the image does.
-fn beside(frame: &Object<'_>, folder: &Path, name: &str, needed: bool) -> Result<Option<PathBuf>> {
-    let Some(value) = frame.get(name) else { return Ok(None) };
-    let path = paths::normal(frame, name, value)?;
-    match paths::find(folder, &path) {
-        None if needed => {
+/// The file that accompanies an image. It must exist if the image does.
+fn needed(frame: &Object<'_>, member: &str, file: &Option<Named>, needed: bool) -> Result<Option<PathBuf>> {
+    match file {
+        Some((path, None)) if needed => {
             let what =
                 format!("there is no file {path}: copy it there, or remove the field to use the image without it");
-            Err(frame.error(name, what))
+            Err(frame.error(member, what))
         }
-        found => Ok(found),
+        file => Ok(file.as_ref().and_then(|(_, file)| Some(file.as_ref()?.path.clone()))),
     }
 }
 
-/// The depth file and its unit: nerfstudio's `depth_file_path`, or instant-ngp's `depth_path`, which needs an
+/// The depth files of a document: nerfstudio's `depth_file_path`, or instant-ngp's `depth_path`, which needs an
 /// `integer_depth_scale`.
-fn depth(top: &Object<'_>, frame: &Object<'_>, folder: &Path, needed: bool) -> Result<Option<(PathBuf, f64)>> {
-    let layers = Layers { top, frame };
-    let unit = layers.find("depth_unit_scale_factor", |object, name| object.positive(name))?;
-    if let Some(path) = beside(frame, folder, "depth_file_path", needed)? {
-        // Float arrays are in scene units.
-        let floats = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npy"));
-        let default = if floats { 1.0 } else { DEPTH_UNIT };
-        return Ok(Some((path, unit.unwrap_or(default))));
+struct Depths {
+    nerfstudio: Vec<Option<Named>>,
+    ngp: Vec<Option<Named>>,
+    ngp_unit: f64,
+}
+
+impl Depths {
+    fn of(top: &Object<'_>, frames: &[&Object<'_>], folder: &Path, assumptions: &mut Vec<String>) -> Result<Self> {
+        let nerfstudio = files(frames, "depth_file_path", folder, assumptions)?;
+        let unit = top.number("integer_depth_scale")?.filter(|scale| *scale > 0.0);
+        let is_used = top.flag("enable_depth_loading")? != Some(false);
+        let ngp = match unit.filter(|_| is_used) {
+            Some(_) => files(frames, "depth_path", folder, assumptions)?,
+            None => vec![None; frames.len()],
+        };
+        Ok(Depths { nerfstudio, ngp, ngp_unit: unit.unwrap_or(1.0) })
     }
-    let Some(scale) = top.number("integer_depth_scale")?.filter(|scale| *scale > 0.0) else { return Ok(None) };
-    if top.flag("enable_depth_loading")? == Some(false) {
-        return Ok(None);
+
+    /// The file and unit of a frame.
+    fn of_frame(&self, i: usize, layers: &Layers<'_, '_>, has_image: bool) -> Result<Option<(PathBuf, f64)>> {
+        let unit = layers.find("depth_unit_scale_factor", |object, name| object.positive(name))?;
+        if let Some(path) = needed(layers.frame, "depth_file_path", &self.nerfstudio[i], has_image)? {
+            // Float arrays are in scene units.
+            let floats = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npy"));
+            let default = if floats { 1.0 } else { DEPTH_UNIT };
+            return Ok(Some((path, unit.unwrap_or(default))));
+        }
+        let path = needed(layers.frame, "depth_path", &self.ngp[i], has_image)?;
+        Ok(path.map(|path| (path, self.ngp_unit)))
     }
-    Ok(beside(frame, folder, "depth_path", needed)?.map(|path| (path, scale)))
 }

@@ -1,8 +1,9 @@
 //! Focal lengths, principal points and sizes: of a whole file, or of a frame of it.
 
-use super::json::{Object, shown};
+use super::json::{Object, number, shown};
 use super::layers::Layers;
 use super::lens;
+use super::matrix::entries;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::Result;
@@ -28,6 +29,12 @@ const NOT_READ: [&str; 14] = [
     "transform_matrix_end",
 ];
 
+/// Names of a 3x3 intrinsic matrix: focal lengths on the diagonal, the principal point in the last column.
+const MATRICES: [&str; 5] = ["K", "intrinsics", "camera_intrinsics", "intrinsic_matrix", "camera_matrix"];
+
+/// The largest difference of two values of a length, in pixels.
+const SAME: f64 = 0.01;
+
 /// Ranges of a camera's lengths in pixels.
 const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e9;
 const CENTRE: f64 = 1e9;
@@ -44,7 +51,7 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     fn nothing(value: &Value) -> bool {
         match value {
             Value::Bool(flag) => !flag,
-            Value::Number(number) => number.as_f64() == Some(0.0),
+            Value::Number(value) => value.as_f64() == Some(0.0),
             Value::Array(values) => values.iter().all(nothing),
             _ => false,
         }
@@ -103,8 +110,12 @@ impl Layers<'_, '_> {
             return Ok(Camera { width, height, focal, centre: middle, lens, pose });
         }
         let mut centre = middle;
-        for (value, name) in centre.iter_mut().zip(["cx", "cy"]) {
-            *value = self.number(name)?.unwrap_or(*value);
+        for (i, (value, name)) in centre.iter_mut().zip(["cx", "cy"]).enumerate() {
+            let of = |object: &Object<'_>| {
+                let of_matrix = matrix_of(object)?.map(|matrix| matrix[2 + i]);
+                agreeing(object, name, object.number(name)?, of_matrix)
+            };
+            *value = of(self.frame)?.map_or_else(|| of(self.top), |own| Ok(Some(own)))?.unwrap_or(*value);
             if value.abs() > CENTRE {
                 return Err(self.error(name, format!("must be a position in pixels, is {value}")));
             }
@@ -162,8 +173,10 @@ impl Layers<'_, '_> {
 
 /// The focal lengths that one object gives: `fl_x` and `fl_y`, or else the angles.
 fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Option<f64>; 2]> {
+    let matrix = matrix_of(object)?;
     let axis = |length: &str, angle: &str, side: usize| {
-        if let Some(f) = object.number(length)? {
+        let of_matrix = matrix.map(|matrix| matrix[usize::from(length == "fl_y")]);
+        if let Some(f) = agreeing(object, length, object.number(length)?, of_matrix)? {
             if !FOCAL.contains(&f) {
                 return Err(object.error(length, format!("must be a focal length in pixels, 1e-3 to 1e9, is {f}")));
             }
@@ -180,6 +193,38 @@ fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Opt
         Ok(Some(f))
     };
     Ok([axis("fl_x", "camera_angle_x", size[0])?, axis("fl_y", "camera_angle_y", size[1])?])
+}
+
+/// The focal lengths and the principal point of an object's intrinsic matrix, if it has one.
+fn matrix_of(object: &Object<'_>) -> Result<Option<[f64; 4]>> {
+    let Some((name, value)) =
+        MATRICES.iter().find_map(|name| Some((name, object.get(name).filter(|value| value.is_array())?)))
+    else {
+        return Ok(None);
+    };
+    let entries: Option<Vec<f64>> = entries(value, 3).and_then(|entries| entries.into_iter().map(number).collect());
+    let matrix = entries.filter(|m| m.len() == 9 && m.iter().all(|x| x.is_finite()));
+    let what = || format!("must be a 3x3 intrinsic matrix, is {}", shown(value));
+    let m: [f64; 9] = matrix.and_then(|m| m.try_into().ok()).ok_or_else(|| object.error(name, what()))?;
+    // Some programs store columns. Only the principal point can stand outside of the diagonal.
+    let ([fx, fy], skew, rest) = ([m[0], m[4]], [m[1], m[3]], m[8]);
+    let [right, below] = [[m[2], m[5]], [m[6], m[7]]];
+    let (centre, other) = if right == [0.0; 2] { (below, right) } else { (right, below) };
+    if skew != [0.0; 2] || other != [0.0; 2] || rest != 1.0 {
+        let what = "must have the rows fx 0 cx, 0 fy cy and 0 0 1";
+        return Err(object.error(name, format!("{what}, is {}", shown(value))));
+    }
+    Ok(Some([fx, fy, centre[0], centre[1]]))
+}
+
+/// A length that is given by its own member, by the intrinsic matrix, or equally by both.
+fn agreeing(object: &Object<'_>, name: &str, own: Option<f64>, of_matrix: Option<f64>) -> Result<Option<f64>> {
+    match (own, of_matrix) {
+        (Some(own), Some(other)) if !((own - other).abs() <= SAME) => {
+            Err(object.error(name, format!("is {own}, but the intrinsic matrix has {other}: remove one of them")))
+        }
+        (own, of_matrix) => Ok(own.or(of_matrix)),
+    }
 }
 
 /// Writes everything of a camera except its pose, for the model `model`.

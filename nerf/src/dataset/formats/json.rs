@@ -1,5 +1,6 @@
 //! JSON documents whose errors name the field.
 
+use super::encodings::decoded;
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use serde_json::{Map, Value};
@@ -8,10 +9,18 @@ use std::path::Path;
 /// The most characters of a value in an error.
 const SHOWN: usize = 40;
 
+/// Names of members that some programs use in place of instant-ngp's.
+const OTHER_NAMES: [(&str, &str); 4] = [("fl_x", "fx"), ("fl_y", "fy"), ("w", "width"), ("h", "height")];
+
+/// A number, also as a string, as some programs write it.
+pub(super) fn number(value: &Value) -> Option<f64> {
+    value.as_f64().or_else(|| value.as_str()?.trim().parse().ok())
+}
+
 /// Reads and parses a file.
 pub(super) fn read(file: &Path) -> Result<Value> {
-    let text = std::fs::read_to_string(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")))?;
-    parse(&text).map_err(|e| Error::file(file, format!("is not valid JSON: {e}")))
+    let bytes = std::fs::read(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")))?;
+    parse(&decoded(&bytes)).map_err(|e| Error::file(file, format!("is not valid JSON: {e}")))
 }
 
 /// Writes a file atomically. Finite numbers round-trip bit for bit.
@@ -26,7 +35,6 @@ pub(super) fn write(file: &Path, object: &Value) -> Result<()> {
 /// Python also writes NaN and Infinity, which JSON does not have. They are read as strings, so that the error can name
 /// the field instead of a line. As null they would count as absent.
 fn parse(text: &str) -> serde_json::Result<Value> {
-    let text = text.trim_start_matches('\u{feff}');
     serde_json::from_str(text).or_else(|error| serde_json::from_str(&quoted(text)).map_err(|_| error))
 }
 
@@ -97,9 +105,11 @@ impl<'a> Object<'a> {
         frames.iter().enumerate().map(object).collect()
     }
 
-    /// A member; `None` if it is absent or null.
+    /// A member, or that of its [other name](OTHER_NAMES); `None` if it is absent or null.
     pub(super) fn get(&self, name: &str) -> Option<&'a Value> {
-        self.members.get(name).filter(|value| !value.is_null())
+        let member = |name: &str| self.members.get(name).filter(|value| !value.is_null());
+        let other = || OTHER_NAMES.iter().find(|(usual, _)| *usual == name).and_then(|(_, other)| member(other));
+        member(name).or_else(other)
     }
 
     /// A required member.
@@ -126,7 +136,7 @@ impl<'a> Object<'a> {
 
     /// A finite number.
     pub(super) fn number(&self, name: &str) -> Result<Option<f64>> {
-        self.typed(name, "a finite number", |value| value.as_f64().filter(|x| x.is_finite()))
+        self.typed(name, "a finite number", |value| number(value).filter(|x| x.is_finite()))
     }
 
     /// A number above 0.
@@ -155,7 +165,7 @@ mod tests {
 
     #[test]
     fn non_finite_numbers_become_strings() {
-        let text = "\u{feff}{\"NaN\\\"NaN\": [NaN, -Infinity, Infinity, \"Infinity \\\\\", 1.5], \"\u{e9}\": NaN}";
+        let text = "{\"NaN\\\"NaN\": [NaN, -Infinity, Infinity, \"Infinity \\\\\", 1.5], \"\u{e9}\": NaN}";
         let expected = json!({ "NaN\"NaN": ["NaN", "-Infinity", "Infinity", "Infinity \\", 1.5], "\u{e9}": "NaN" });
         assert_eq!(parse(text).unwrap(), expected);
         assert!(parse("{\"a\": NaNa}").unwrap_err().to_string().contains("column 7"), "the place in the file");

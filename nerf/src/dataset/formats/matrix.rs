@@ -1,6 +1,6 @@
-//! Matrices of transforms in JSON: three or four rows of four numbers.
+//! Matrices of transforms in JSON: three or four rows of four numbers, nested or flat.
 
-use super::json::{Object, shown};
+use super::json::{Object, number, shown};
 use super::rigid::{TOLERANCE, is_orthonormal, rotation};
 use crate::error::Result;
 use glam::{DAffine3, DMat3, DVec3};
@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 /// Reads an invertible affine transform.
 pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>> {
     let Some(matrix) = object.get(name) else { return Ok(None) };
-    let transform = rows(matrix).map_err(|what| object.error(name, what))?;
+    let transform = transform(matrix).map_err(|what| object.error(name, what))?;
     let determinant = transform.matrix3.determinant();
     if !(determinant != 0.0 && determinant.is_finite()) {
         return Err(object.error(name, format!("must be invertible, but its determinant is {determinant}")));
@@ -17,27 +17,49 @@ pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>
     Ok(Some(transform))
 }
 
-/// Reads a camera-to-world matrix: a rotation and a translation.
-pub(super) fn pose(object: &Object<'_>, name: &str) -> Result<DAffine3> {
+/// Reads a camera-to-world matrix: a rotation and a translation. The inner error is that of a number that is not finite.
+pub(super) fn pose(object: &Object<'_>, name: &str) -> Result<Result<DAffine3>> {
     let matrix = object.required(name)?;
-    rows(matrix).and_then(rigid).map_err(|what| object.error(name, what))
+    let pose = transform(matrix).and_then(rigid).map_err(|what| object.error(name, what));
+    let is_infinite = |value: &&Value| number(value).is_some_and(|number| !number.is_finite());
+    match entries(matrix, 4).is_some_and(|entries| entries.iter().any(is_infinite)) {
+        true => Ok(pose),
+        false => pose.map(Ok),
+    }
+}
+
+/// The entries of a matrix with this number of columns, row by row: a list of rows or a flat list. `None` for other
+/// values.
+pub(super) fn entries(matrix: &Value, columns: usize) -> Option<Vec<&Value>> {
+    let rows = matrix.as_array()?;
+    if rows.iter().any(Value::is_array) {
+        let rows: Option<Vec<&Vec<Value>>> =
+            rows.iter().map(|row| row.as_array().filter(|row| row.len() == columns)).collect();
+        return Some(rows?.into_iter().flatten().collect());
+    }
+    rows.len().is_multiple_of(columns).then(|| rows.iter().collect())
 }
 
 /// Three or four rows of four finite numbers, where a fourth is `0 0 0 1`; or an error message.
-fn rows(matrix: &Value) -> std::result::Result<DAffine3, String> {
-    let shape = || format!("must be 3 or 4 rows of 4 numbers, is {}", shown(matrix));
-    let rows = matrix.as_array().filter(|rows| rows.len() == 3 || rows.len() == 4).ok_or_else(shape)?;
+fn transform(matrix: &Value) -> std::result::Result<DAffine3, String> {
+    let entries = entries(matrix, 4).filter(|entries| matches!(entries.len(), 12 | 16));
+    let entries = entries.ok_or_else(|| format!("must be 3 or 4 rows of 4 numbers, is {}", shown(matrix)))?;
     let mut m = [[0.0, 0.0, 0.0, 1.0]; 4];
-    for (r, row) in rows.iter().enumerate() {
-        let row = row.as_array().filter(|row| row.len() == 4).ok_or_else(shape)?;
-        for (c, value) in row.iter().enumerate() {
-            let finite = value.as_f64().filter(|x| x.is_finite());
-            let what = || format!("row {r}, column {c} is not a finite number: {}", shown(value));
-            m[r][c] = finite.ok_or_else(what)?;
-        }
+    for (i, value) in entries.into_iter().enumerate() {
+        let [r, c] = [i / 4, i % 4];
+        let what = || format!("row {r}, column {c} is not a finite number: {}", shown(value));
+        m[r][c] = number(value).filter(|x| x.is_finite()).ok_or_else(what)?;
     }
-    if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(value, expected)| (value - expected).abs() > TOLERANCE) {
-        return Err(format!("the last row must be 0 0 0 1, is {} {} {} {}", m[3][0], m[3][1], m[3][2], m[3][3]));
+    let [x, y, z, one] = m[3];
+    let is_last = |row: [f64; 4]| row.iter().zip([0.0, 0.0, 0.0, 1.0]).all(|(a, b)| (a - b).abs() <= TOLERANCE);
+    if !is_last(m[3]) && is_last(m.map(|row| row[3])) {
+        return Err(format!(
+            "is transposed: its last column is 0 0 0 1 and its last row {x} {y} {z} {one}; write rows, where ARKit and \
+             three.js store columns"
+        ));
+    }
+    if !is_last(m[3]) {
+        return Err(format!("the last row must be 0 0 0 1, is {x} {y} {z} {one}"));
     }
     let column = |c: usize| DVec3::new(m[0][c], m[1][c], m[2][c]);
     Ok(DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) })
@@ -53,6 +75,13 @@ fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
             "the upper left 3x3 must be a rotation, but scales by {scale:.6}: divide these nine numbers by \
              that, and leave the position in the last column as it is"
         ));
+    }
+    if m.determinant() < 0.0 && is_orthonormal(&m, TOLERANCE) {
+        return Err(
+            "the upper left 3x3 mirrors (its determinant is -1): its world or its camera has left-handed axes, \
+            as in Unity and Unreal; export right-handed axes"
+                .to_owned(),
+        );
     }
     rotation(&m).map_err(|what| format!("the upper left 3x3 {what}"))?;
     Ok(transform)

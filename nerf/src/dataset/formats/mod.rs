@@ -5,6 +5,7 @@
 
 pub mod blender;
 pub mod colmap;
+mod encodings;
 mod frames;
 mod intrinsics;
 mod json;
@@ -12,6 +13,7 @@ mod layers;
 mod lens;
 mod limits;
 pub mod llff;
+mod locate;
 mod matrix;
 mod models;
 pub(super) mod npy;

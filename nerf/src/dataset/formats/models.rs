@@ -5,8 +5,8 @@ use crate::camera::lens::Lens;
 /// A camera model.
 #[derive(Debug, PartialEq)]
 pub(super) struct Model {
-    /// COLMAP's number, if COLMAP has the model.
-    pub id: Option<i32>,
+    /// COLMAP's number.
+    pub id: i32,
     pub name: &'static str,
     /// True if both axes share one focal length.
     pub single: bool,
@@ -22,10 +22,10 @@ const FISHEYE: Lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
 const FOV: Lens = Lens::Fov { omega: 0.0 };
 
 const fn model(id: i32, name: &'static str, single: bool, kind: Lens, coefficients: &'static [&'static str]) -> Model {
-    Model { id: Some(id), name, single, kind, coefficients }
+    Model { id, name, single, kind, coefficients }
 }
 
-pub(super) const MODELS: [Model; 12] = [
+pub(super) const MODELS: [Model; 14] = [
     model(0, "SIMPLE_PINHOLE", true, PINHOLE, &[]),
     model(1, "PINHOLE", false, PINHOLE, &[]),
     model(2, "SIMPLE_RADIAL", true, BROWN, &["k1"]),
@@ -37,7 +37,9 @@ pub(super) const MODELS: [Model; 12] = [
     model(5, "OPENCV_FISHEYE", false, FISHEYE, &["k1", "k2", "k3", "k4"]),
     model(10, "THIN_PRISM_FISHEYE", false, FISHEYE, &["k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"]),
     model(7, "FOV", false, FOV, &["omega"]),
-    Model { id: None, name: "EQUIRECTANGULAR", single: false, kind: Lens::Equirectangular, coefficients: &[] },
+    model(14, "SIMPLE_FISHEYE", true, FISHEYE, &[]),
+    model(15, "FISHEYE", false, FISHEYE, &[]),
+    model(17, "EQUIRECTANGULAR", false, Lens::Equirectangular, &[]),
 ];
 
 impl Model {

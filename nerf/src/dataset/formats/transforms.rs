@@ -3,7 +3,7 @@
 //! Camera parameters stand at the top of the file or in its frames; those of a frame take precedence. Poses are read
 //! unchanged: instant-ngp's `scale` and `offset`, and other fields that do not affect cameras, are ignored.
 
-use super::frames::{Dialect, views};
+use super::frames::{Dialect, Frames};
 use super::json::{self, Object, shown};
 use super::{intrinsics, lens, matrix, paths, ply};
 use crate::camera::lens::Lens;
@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use glam::DAffine3;
 use serde_json::{Map, Value};
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
 const FILE: &str = "transforms.json";
@@ -39,8 +39,9 @@ pub fn read(folder: &Path) -> Result<Capture> {
     let file = folder.join(FILE);
     let document = json::read(&file)?;
     let top = Object::top(&file, &document)?;
-    let mut views = views(&top, folder, Dialect::Transforms)?;
-    read_splits(&top, &mut views)?;
+    let Frames { views, left_out, assumptions, .. } = Frames::read(&[top.clone()], folder, Dialect::Transforms)?;
+    let mut views: Vec<View> = views.into_iter().flatten().collect();
+    read_splits(&top, &mut views, &left_out)?;
     let scale = top.positive("applied_scale")?.unwrap_or(1.0);
     let transform = matrix::affine(&top, "applied_transform")?.unwrap_or(DAffine3::IDENTITY);
     // nerfstudio scales after the transform.
@@ -54,7 +55,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
     // The points are in the coordinates of the file: nerfstudio transforms them together with the cameras.
     let points = points_file.as_deref().map_or(Ok(vec![]), ply::read)?;
     let capture = Capture::new(folder, file.clone(), Format::Transforms, views);
-    Ok(Capture { points, points_file, aabb_scale, applied, ..capture })
+    Ok(Capture { points, points_file, aabb_scale, applied, assumptions, ..capture })
 }
 
 /// The field with the images of a split.
@@ -62,7 +63,8 @@ fn list(split: Split) -> String {
     format!("{split}_filenames")
 }
 
-fn read_splits(top: &Object<'_>, views: &mut [View]) -> Result<()> {
+/// Sets the splits of the views; lists may also name frames that were `left_out`.
+fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>) -> Result<()> {
     let mut named: HashMap<&str, Vec<usize>> = HashMap::new();
     views.iter().enumerate().for_each(|(i, view)| named.entry(&view.name).or_default().push(i));
     let mut splits: Vec<Option<Split>> = vec![None; views.len()];
@@ -74,6 +76,9 @@ fn read_splits(top: &Object<'_>, views: &mut [View]) -> Result<()> {
             let field = format!("{field}[{i}]");
             let name = paths::normal(top, &field, name)?;
             let Some(places) = named.get(name.as_str()) else {
+                if left_out.contains(&name) {
+                    continue;
+                }
                 return Err(top.error(&field, format!("lists {name}, but no frame has this file_path")));
             };
             for &place in places {

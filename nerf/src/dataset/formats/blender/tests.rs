@@ -247,3 +247,19 @@ fn damaged_blender_files_are_named() {
         }
     });
 }
+
+#[test]
+fn images_of_another_split_take_no_place() {
+    let folder = folder(|_| {});
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("transforms_test.json"), document(&["test/r_0"]).to_string()).unwrap();
+    picture(&at("unlisted/r_0.png"), 8, 6);
+    std::fs::rename(at("train"), at("val")).unwrap();
+    // Two splits list the name, and a folder of another kind fits neither.
+    says(
+        &failure(read(folder.path()), FILE),
+        &["`test/r_0` and `train/r_0` do not exist", "`unlisted/r_0.png` fits both"],
+    );
+    std::fs::remove_dir_all(at("unlisted")).unwrap();
+    assert!(read(folder.path()).unwrap().views.iter().all(|view| view.image.is_none()));
+}

@@ -1,6 +1,8 @@
 //! The images and masks of a model.
 
+use super::super::locate::locate;
 use crate::dataset::capture::Capture;
+use crate::error::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Names of image folders.
@@ -9,7 +11,10 @@ const IMAGES: [&str; 4] = ["images", "image", "rgb", "input"];
 const MASKS: [&str; 2] = ["masks", "mask"];
 
 /// Sets the existing image and mask of each view. `model` is the folder of the model.
-pub(super) fn attach(capture: &mut Capture, model: &Path) {
+///
+/// # Errors
+/// If two files fit the name of an image.
+pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     let mut roots = vec![capture.folder.clone()];
     if model == capture.folder {
         // The capture's folder may be `sparse` or `sparse/0` itself.
@@ -23,13 +28,31 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) {
     let mut images = folders(&IMAGES);
     images.push(capture.folder.clone());
     let has_any = |folder: &&PathBuf| capture.views.iter().any(|view| folder.join(&view.name).is_file());
-    let images = images.iter().find(has_any).cloned();
+    let (folder, below) = match images.iter().find(has_any) {
+        Some(folder) => (folder.clone(), ""),
+        // Names of a model are relative to its folder of images.
+        None => (root(capture, model), "images/"),
+    };
+    let names: Vec<String> = capture.views.iter().map(|view| format!("{below}{}", view.name)).collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let found = locate(&folder, &names, &mut capture.assumptions);
+    let found = found.map_err(|(i, what)| Error::field(&capture.file, &capture.views[i].field, what))?;
     let masks = folders(&MASKS);
-    for view in &mut capture.views {
+    for (view, image) in capture.views.iter_mut().zip(found) {
         let exists = |path: &PathBuf| path.is_file();
-        view.image = images.as_ref().map(|folder| folder.join(&view.name)).filter(exists);
+        view.image = image.map(|image| image.path);
         // COLMAP's own naming comes first.
         let names = [PathBuf::from(format!("{}.png", view.name)), Path::new(&view.name).with_extension("png")];
         view.mask = masks.iter().flat_map(|folder| names.iter().map(move |name| folder.join(name))).find(exists);
     }
+    Ok(())
+}
+
+/// The folder of the capture: that of `sparse` for the model `sparse/0`.
+fn root(capture: &Capture, model: &Path) -> PathBuf {
+    if model != capture.folder {
+        return capture.folder.clone();
+    }
+    let sparse = model.ancestors().take(2).find(|folder| folder.ends_with("sparse"));
+    sparse.and_then(Path::parent).unwrap_or(model).to_owned()
 }

@@ -1,5 +1,6 @@
 //! COLMAP's `.bin` files: numbers in a row, little-endian, each list after its length.
 
+use super::super::encodings::decoded;
 use super::entries::{CameraEntry, ImageEntry, Place};
 use super::models;
 use super::table::Table;
@@ -62,8 +63,20 @@ impl<'a> Cursor<'a> {
         self.array(place, member).map(u64::from_le_bytes)
     }
 
+    fn f64(&mut self, place: Place, member: &str) -> Result<f64> {
+        self.array(place, member).map(f64::from_le_bytes)
+    }
+
+    fn f64s<const N: usize>(&mut self, place: Place, member: &str) -> Result<[f64; N]> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = self.f64(place, member)?;
+        }
+        Ok(values)
+    }
+
     fn number(&mut self, place: Place, member: &str) -> Result<f64> {
-        let value = f64::from_le_bytes(self.array(place, member)?);
+        let value = self.f64(place, member)?;
         if !value.is_finite() {
             return Err(place.error(self.file, member, format!("must be a finite number, is {value}")));
         }
@@ -79,11 +92,11 @@ impl<'a> Cursor<'a> {
     }
 
     /// Reads a text that ends in a zero byte.
-    fn text(&mut self, place: Place, member: &str) -> Result<&'a str> {
+    fn text(&mut self, place: Place, member: &str) -> Result<String> {
         let end = self.rest.iter().position(|byte| *byte == 0).ok_or_else(|| self.ended(place, member))?;
         let (text, rest) = self.rest.split_at(end);
         self.rest = &rest[1..];
-        std::str::from_utf8(text).map_err(|e| place.error(self.file, member, format!("is not UTF-8 text: {e}")))
+        Ok(decoded(text))
     }
 
     /// Skips a list; returns its length.
@@ -108,10 +121,20 @@ pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
         let place = Place::Item("cameras", index);
         let id = cursor.u32(place, "camera_id")?;
         let model = cursor.array(place, "model").map(i32::from_le_bytes)?;
-        let model = models::by_id(model).map_err(|what| place.error(file, "model", what))?;
+        let model = models::by_id(model);
         let size = [cursor.u64(place, "width")?, cursor.u64(place, "height")?];
-        let params = models::params(model).map(|name| cursor.number(place, name)).collect::<Result<Vec<f64>>>()?;
-        let camera = models::camera(model, size, &params).map_err(|(member, what)| place.error(file, member, what))?;
+        let camera = match model {
+            Ok(model) => {
+                let params = models::params(model).map(|name| cursor.f64(place, name)).collect::<Result<Vec<f64>>>()?;
+                models::camera(model, size, &params).map_err(|(member, what)| place.error(file, member, what))
+            }
+            Err((Some(count), what)) => {
+                (0..count).try_for_each(|_| cursor.f64(place, "params").map(drop))?;
+                Err(place.error(file, "model", what))
+            }
+            // The next camera starts after an unknown number of parameters.
+            Err((None, what)) => return Err(place.error(file, "model", what)),
+        };
         cameras.push(CameraEntry { place, id, camera });
     }
     Ok(cameras)
@@ -124,11 +147,11 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
     for index in 0..count {
         let place = Place::Item("images", index);
         let id = cursor.u32(place, "image_id")?;
-        let (q, t) = (cursor.numbers(place, "qvec")?, cursor.numbers(place, "tvec")?);
+        let (q, t) = (cursor.f64s(place, "qvec")?, cursor.f64s(place, "tvec")?);
         let camera = cursor.u32(place, "camera_id")?;
         let name = cursor.text(place, "name")?;
         cursor.skip_list(place, "points2D", OBSERVATION)?;
-        images.push(ImageEntry::new(file, place, id, q, t, camera, name)?);
+        images.push(ImageEntry::new(file, place, id, q, t, camera, &name)?);
     }
     Ok(images)
 }
@@ -155,7 +178,7 @@ pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {
     cameras.extend((table.cameras.len() as u64).to_le_bytes());
     for camera in &table.cameras {
         cameras.extend(camera.id.to_le_bytes());
-        cameras.extend(camera.model.id.unwrap_or(-1).to_le_bytes());
+        cameras.extend(camera.model.id.to_le_bytes());
         camera.size.iter().for_each(|side| cameras.extend(side.to_le_bytes()));
         numbers(&mut cameras, &camera.params);
     }

@@ -37,14 +37,16 @@ impl Place {
 pub(super) struct CameraEntry {
     pub(super) place: Place,
     pub(super) id: u32,
-    pub(super) camera: Camera,
+    /// An error leaves out the images of this camera.
+    pub(super) camera: Result<Camera>,
 }
 
 /// An image of the file.
 pub(super) struct ImageEntry {
     pub(super) place: Place,
     pub(super) id: u32,
-    pub(super) pose: DAffine3,
+    /// An error leaves out this image.
+    pub(super) pose: Result<DAffine3>,
     pub(super) camera: u32,
     pub(super) name: String,
 }
@@ -60,8 +62,10 @@ impl ImageEntry {
         camera: u32,
         name: &str,
     ) -> Result<Self> {
-        let pose = pose::from_file(q, t).map_err(|(member, what)| place.error(file, member, what))?;
-        let name = name.strip_prefix("./").unwrap_or(name).to_owned();
+        let pose = pose::from_file(q, t).map_err(|(member, what)| place.error(file, member, what));
+        // Models that were made on Windows.
+        let name = name.replace('\\', "/");
+        let name = name.strip_prefix("./").unwrap_or(&name).to_owned();
         if name.is_empty() {
             return Err(place.error(file, "name", "is empty"));
         }

@@ -7,34 +7,31 @@ use crate::dataset::formats::limits::{MOST_PIXELS, start};
 use glam::DAffine3;
 use std::f64::consts::PI;
 
-/// COLMAP's unsupported models, from number 11 on.
-const OTHERS: [&str; 7] = [
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-    "SIMPLE_DIVISION",
-    "DIVISION",
-    "SIMPLE_FISHEYE",
-    "FISHEYE",
-    "EUCM",
-    "EQUIRECTANGULAR",
-];
+/// COLMAP's unsupported models: the number, the name and the number of parameters.
+const OTHERS: [(i32, &str, usize); 4] =
+    [(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16), (12, "SIMPLE_DIVISION", 4), (13, "DIVISION", 5), (16, "EUCM", 6)];
 
-/// The model with a number, or an error message.
-pub(super) fn by_id(id: i32) -> Result<&'static Model, String> {
-    MODELS.iter().find(|model| model.id == Some(id)).ok_or_else(|| {
-        let other = id.checked_sub(11).and_then(|i| usize::try_from(i).ok()).and_then(|i| OTHERS.get(i));
-        unsupported(&other.map_or(id.to_string(), |name| format!("{name} ({id})")))
+/// The model with a number; or its number of parameters, if it is known, and an error message.
+pub(super) fn by_id(id: i32) -> Result<&'static Model, (Option<usize>, String)> {
+    MODELS.iter().find(|model| model.id == id).ok_or_else(|| match OTHERS.iter().find(|other| other.0 == id) {
+        Some((_, name, count)) => (Some(*count), unsupported(&format!("{name} ({id})"))),
+        None => (None, unsupported(&id.to_string())),
     })
 }
 
 /// The model with a name, or an error message.
 pub(super) fn by_name(name: &str) -> Result<&'static Model, String> {
-    Model::named(name).filter(|model| model.id.is_some()).ok_or_else(|| unsupported(&start(name)))
+    Model::named(name).ok_or_else(|| unsupported(&start(name)))
 }
 
 /// The names of a model's parameters, in the order of the files.
 pub(super) fn params(model: &Model) -> impl Iterator<Item = &'static str> {
-    let focal: &[&str] = if model.single { &["f"] } else { &["fx", "fy"] };
-    focal.iter().chain(&["cx", "cy"]).chain(model.coefficients).copied()
+    let own: &[&str] = match model.kind {
+        Lens::Equirectangular => &["w", "h"],
+        _ if model.single => &["f", "cx", "cy"],
+        _ => &["fx", "fy", "cx", "cy"],
+    };
+    own.iter().chain(model.coefficients).copied()
 }
 
 /// The camera with these parameters and the identity as its pose; as an error, the wrong parameter and a message.
@@ -50,6 +47,18 @@ pub(super) fn camera(
         _ => Err((name, format!("must be 1 to {MOST_PIXELS} pixels, is {pixels}"))),
     };
     let (width, height) = (side("width", width)?, side("height", height)?);
+    if let Some((name, value)) = params(model).zip(values).find(|(_, value)| !value.is_finite()) {
+        return Err((name, format!("must be a finite number, is {value}")));
+    }
+    if model.kind == Lens::Equirectangular {
+        let [w, h] = [width as f64, height as f64];
+        if [or_zero("w"), or_zero("h")] != [w, h] {
+            let what = format!("must be those of the image, {w} and {h}, are {} and {}", or_zero("w"), or_zero("h"));
+            return Err(("w and h", what));
+        }
+        let (focal, centre) = ([w / (2.0 * PI), h / PI], [0.5 * w, 0.5 * h]);
+        return Ok(Camera { width, height, focal, centre, lens: Lens::Equirectangular, pose: DAffine3::IDENTITY });
+    }
     let focal = ["fx", "fy"].map(|name| or_zero(if model.single { "f" } else { name }));
     if let Some(focal) = focal.iter().find(|focal| !(**focal > 0.0)) {
         return Err(("focal length", format!("must be more than 0, is {focal}")));
@@ -68,7 +77,8 @@ pub(super) fn camera(
 
 fn unsupported(name: &str) -> String {
     let remedy = "undistort the images with `colmap image_undistorter`";
-    format!("{name} is not supported (those from SIMPLE_PINHOLE to THIN_PRISM_FISHEYE are): {remedy}")
+    let others = OTHERS.map(|(_, name, _)| name).join(", ");
+    format!("{name} is not supported (all COLMAP models but {others} are): {remedy}")
 }
 
 /// Replaces a lens without distortion by an equal pinhole.
@@ -82,14 +92,14 @@ fn simplest(lens: Lens) -> Lens {
 /// The smallest model that holds a camera exactly, and its parameters; or an error message.
 pub(super) fn model_of(camera: &Camera) -> Result<(&'static Model, Vec<f64>), String> {
     let lens = simplest(camera.lens);
-    let Ok(model) = by_name(least(&lens, 2)) else {
-        return Err("is equirectangular, which COLMAP does not support: cut it into pinhole views first".into());
-    };
+    let model = by_name(least(&lens, 2))?;
     let value = |name| match name {
         "fx" => camera.focal[0],
         "fy" => camera.focal[1],
         "cx" => camera.centre[0],
         "cy" => camera.centre[1],
+        "w" => camera.width as f64,
+        "h" => camera.height as f64,
         name => coefficient(&lens, name),
     };
     Ok((model, params(model).map(value).collect()))
@@ -114,12 +124,18 @@ mod tests {
             (8, "SIMPLE_RADIAL_FISHEYE", 4),
             (9, "RADIAL_FISHEYE", 5),
             (10, "THIN_PRISM_FISHEYE", 12),
+            (14, "SIMPLE_FISHEYE", 3),
+            (15, "FISHEYE", 4),
+            (17, "EQUIRECTANGULAR", 2),
         ];
         for (id, name, count) in list {
-            let [by_id, by_name] = [by_id(id), by_name(name)].map(|model| model.ok().unwrap());
-            assert_eq!((by_id.name, params(by_id).count(), by_name.id), (name, count, Some(id)));
+            let [by_id, by_name] = [by_id(id).ok(), by_name(name).ok()].map(Option::unwrap);
+            assert_eq!((by_id.name, params(by_id).count(), by_name.id), (name, count, id));
         }
-        assert!(["OPENCV2", "EQUIRECTANGULAR"].iter().all(|name| by_name(name).is_err()));
-        assert!(by_id(11).is_err() && by_id(-1).is_err());
+        assert!(by_name("OPENCV2").is_err());
+        assert_eq!(
+            [11, 12, 13, 16, 18, -1].map(|id| by_id(id).unwrap_err().0),
+            [Some(16), Some(4), Some(5), Some(6), None, None]
+        );
     }
 }

@@ -13,6 +13,11 @@ fn rotation(q: [f64; 4]) -> Option<DMat3> {
 
 /// The pose of an image; as an error, the wrong member and a message.
 pub(super) fn from_file(q: [f64; 4], t: [f64; 3]) -> Result<DAffine3, (&'static str, String)> {
+    for (member, values) in [("qvec", &q[..]), ("tvec", &t)] {
+        if let Some(value) = values.iter().find(|value| !value.is_finite()) {
+            return Err((member, format!("must be a finite number, is {value}")));
+        }
+    }
     let Some(to_camera) = rotation(q) else {
         return Err(("qvec", "is a quaternion of length 0; use one of length 1".into()));
     };

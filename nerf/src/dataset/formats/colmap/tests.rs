@@ -186,7 +186,7 @@ pub(super) fn fails(encoding: Encoding, which: usize, bytes: &[u8], field: &str,
 #[test]
 fn text_errors_name_the_line() {
     let cases = [
-        (0, "-0.125", "NaN", "`line 4`", "k1: must be a finite number, is `NaN`"),
+        (0, "-0.125", "NaN", "`line 4`", "k1: must be a finite number, is NaN"),
         (0, "-0.125", "1e400", "`line 4`", "k1: must be a finite number"),
         (0, " -0.125", "", "`line 4`", "k1: is missing"),
         (0, "-0.125", "0 0", "`line 4`", "PARAMS: SIMPLE_RADIAL takes 4: remove the others"),
@@ -199,7 +199,7 @@ fn text_errors_name_the_line() {
         (0, " 90 ", " -90 ", "`line 4`", "focal length: must be more than 0, is -90"),
         (0, "9 SIMPLE", "-9 SIMPLE", "`line 4`", "CAMERA_ID: must be an integer of 32 bits"),
         (1, "0.5 0.5 0.5 0.5", "0 0 0 0", "`line 3`", "qvec: is a quaternion of length 0"),
-        (1, "0.5 0.5 0.5 0.5", "inf 0 0 0", "`line 3`", "QVEC: must be a finite number, is `inf`"),
+        (1, "0.5 0.5 0.5 0.5", "inf 0 0 0", "`line 3`", "qvec: must be a finite number, is inf"),
         (1, " 9 b", " 8 b", "`line 3`", "camera_id: is 8, but"),
         (1, "1 1 0", "3 1 0", "`line 5`", "image_id: is `3`, as that of line 3 is"),
         (1, "a.png", "b/second.png", "`line 5`", "name: is `b/second.png`, as that of line 3 is"),
@@ -207,7 +207,7 @@ fn text_errors_name_the_line() {
         (1, "10.5 11.5 1 12.5 13.5 -1 \n", "", "`line 4`", "POINTS2D: must be triples"),
         (1, "13.5 -1 \n", "13.5\n", "`line 4`", "POINTS2D: must be triples"),
         (2, "2 1 2 255", "2 1 2 256", "`line 2`", "B: must be an integer of 8 bits, is `256`"),
-        (2, "5 9 8", "nan 9 8", "`line 3`", "Z: must be a finite number, is `nan`"),
+        (2, "5 9 8", "nan 9 8", "`line 3`", "Z: must be a finite number, is NaN"),
         (2, "7 -1", "7 -1 5", "`line 3`", "TRACK: must be pairs"),
         (2, " -1\n", "", "`line 3`", "ERROR: is missing"),
     ];
@@ -216,7 +216,7 @@ fn text_errors_name_the_line() {
         fails(Encoding::Text, which, TEXT[which].replacen(from, to, 1).as_bytes(), field, expected);
     }
     fails(Encoding::Text, 1, b"# nothing\n", "`images`", "is empty");
-    fails(Encoding::Text, 0, b"\xff", "cameras.txt", "is not UTF-8 text");
+    fails(Encoding::Text, 0, b"\xff", "cameras.txt", "CAMERA_ID: must be an integer");
 }
 
 #[test]
@@ -236,8 +236,12 @@ fn binary_errors_name_the_entry() {
         let bytes = with(&cameras, second + 4, &id.to_le_bytes());
         fails(Binary, 0, &bytes, "`cameras[1].model`", expected);
     };
-    model(11, "RAD_TAN_THIN_PRISM_FISHEYE (11) is not supported");
-    model(17, "EQUIRECTANGULAR (17) is not supported");
+    for (id, name, parameters) in [(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16), (13, "DIVISION", 5)] {
+        let cameras = with(&cameras, second + 4, &u32::to_le_bytes(id));
+        let parameters = vec![0.5; parameters];
+        let bytes = Bytes(cameras[..second + 24].to_vec()).f64s(&parameters).0;
+        fails(Binary, 0, &bytes, "`cameras[1].model`", &format!("{name} ({id}) is not supported"));
+    }
     model(18, "18 is not supported");
     model(u32::MAX, "-1 is not supported");
     fails(Binary, 0, &with(&cameras, second + 8, &[0]), "`cameras[1].width`", "must be 1 to");
@@ -256,7 +260,6 @@ fn binary_errors_name_the_entry() {
     fails(Binary, 1, &with(&images, 12, &[0; 32]), "`images[0].qvec`", "length 0");
     fails(Binary, 1, &with(&images, 44, &f64::INFINITY.to_le_bytes()), "`images[0].tvec`", "finite number, is inf");
     fails(Binary, 1, &with(&images, 68, &[8]), "`images[0].camera_id`", "is 8, but");
-    fails(Binary, 1, &with(&images, 72, &[255]), "`images[0].name`", "is not UTF-8");
     fails(Binary, 1, &with(&images, 72, &[0]), "`images[0]", "");
     fails(Binary, 1, &with(&images, 73, b"\n"), "`images[0].name`", "`b\\nsecond.png` has a control character");
     for count in [u64::MAX, 1 << 61, 100] {
@@ -288,4 +291,91 @@ fn hand_written_text_files_are_read() {
         DMat3::from_quat(turned),
         views[0].camera.pose.matrix3 * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0))
     );
+}
+
+/// The cameras and images of eight views, each with its camera; the lines of one can be replaced.
+fn eight(change: impl Fn(usize) -> Option<[String; 2]>) -> [Vec<u8>; 3] {
+    let own = |i: usize| [format!("{i} PINHOLE 8 6 9 9 4 3"), format!("{i} 1 0 0 0 0 0 4 {i} {i}.png\n")];
+    let lines: Vec<[String; 2]> = (0..8).map(|i| change(i).unwrap_or_else(|| own(i))).collect();
+    let [cameras, images] = [0, 1].map(|part| lines.iter().map(|line| line[part].clone() + "\n").collect::<String>());
+    [cameras.into_bytes(), images.into_bytes(), vec![]]
+}
+
+#[test]
+fn single_invalid_cameras_are_left_out() {
+    let whole = |i: usize| [format!("{i} PINHOLE 8 6 9 9 4 3"), format!("{i} 1 0 0 0 0 0 4 {i} {i}.png\n")];
+    let read = |files: &[Vec<u8>; 3]| read(folder(Encoding::Text, "sparse/0", files).path());
+    for (camera, image, expected) in [
+        ("3 PINHOLE 8 6 nan 9 4 3", "", "fx: must be a finite number, is NaN"),
+        ("3 PINHOLE 0 6 9 9 4 3", "", "width: must be 1 to"),
+        ("3 EUCM 8 6 9 9 4 3 1 1", "", "EUCM is not supported"),
+        ("", "3 0 0 0 0 0 0 4 3 3.png\n", "qvec: is a quaternion of length 0"),
+        ("", "3 1 0 0 0 inf 0 4 3 3.png\n", "tvec: must be a finite number, is inf"),
+    ] {
+        let bad = |i: usize| {
+            let lines = |own: String, other: &str| if other.is_empty() { own } else { other.to_owned() };
+            let [own_camera, own_image] = whole(i);
+            [lines(own_camera, camera), lines(own_image, image)]
+        };
+        let capture = read(&eight(|i| (i == 3).then(|| bad(3)))).unwrap();
+        assert_eq!(capture.views.len(), 7);
+        assert!(capture.views.iter().all(|view| view.name != "3.png"));
+        let [what] = &capture.assumptions[..] else { panic!("{:?}", capture.assumptions) };
+        assert!(what.starts_with("left out 1 of 8 images without a valid camera, such as `3.png`: "), "{what}");
+        assert!(what.contains(expected), "{what}");
+        // Half of the images make no scene.
+        let with_number = |i: usize| bad(i).map(|line| line.replacen('3', &i.to_string(), 1));
+        let most =
+            eight(|i| (i >= 4).then(|| with_number(i).map(|line| line.replace(" 3 3.png", &format!(" {i} {i}.png")))));
+        assert!(read(&most).unwrap_err().to_string().contains(expected));
+    }
+}
+
+#[test]
+fn spherical_and_plain_fisheye_models_are_read() {
+    let with = |camera: &str| {
+        let line = camera.to_owned();
+        let files = eight(|i| (i == 0).then(|| [line.clone(), "0 1 0 0 0 0 0 4 0 0.png\n".to_owned()]));
+        read(folder(Encoding::Text, "sparse/0", &files).path()).unwrap().views[0].camera.clone()
+    };
+    let panorama = with("0 EQUIRECTANGULAR 80 40 80 40");
+    assert_eq!(panorama.lens, Lens::Equirectangular);
+    // COLMAP's formula: longitude 2 pi (x / w - 1/2), latitude pi (1/2 - y / h), in its axes.
+    let (theta, phi) = (2.0 * std::f64::consts::PI * (0.7 - 0.5), std::f64::consts::PI * (0.5 - 0.4));
+    let expected = DVec3::new(phi.cos() * theta.sin(), -phi.sin(), phi.cos() * theta.cos());
+    assert!(panorama.ray(56.0, 16.0).direction.distance(expected) < 1e-12, "the pose is the identity in COLMAP's axes");
+    let lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
+    let fisheye = with("0 SIMPLE_FISHEYE 8 6 9 4 3");
+    assert_eq!((fisheye.lens, fisheye.focal, fisheye.centre), (lens, [9.0; 2], [4.0, 3.0]));
+    assert_eq!(with("0 FISHEYE 8 6 9 10 4 3").focal, [9.0, 10.0]);
+}
+
+#[test]
+fn images_are_found_in_other_folders_and_spellings() {
+    let [cameras, images, points] = text();
+    let images = String::from_utf8(images).unwrap().replace("b/second.png", "b\\second.png").into_bytes();
+    let folder = folder(Encoding::Text, "sparse/0", &[cameras, images, points]);
+    let touch = |path: &str| {
+        let path = folder.path().join(path);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, "").unwrap();
+        path
+    };
+    let found = || {
+        read(folder.path())
+            .map(|capture| (capture.views.into_iter().map(|view| view.image).collect::<Vec<_>>(), capture.assumptions))
+    };
+    let second = touch("images/b/second.png");
+    assert_eq!(found().unwrap(), (vec![None, Some(second.clone())], vec![]), "of Windows");
+    let first = touch("images/A.JPG");
+    let expected = ["`a.png` does not exist: used `A.JPG`".to_owned()];
+    assert_eq!(found().unwrap(), (vec![Some(first), Some(second)], expected.to_vec()));
+    touch("images/a.webp");
+    assert!(found().unwrap_err().to_string().contains("`A.JPG` and `a.webp` fit"));
+    // Another name of the folder.
+    fs::remove_file(folder.path().join("images/a.webp")).unwrap();
+    fs::rename(folder.path().join("images"), folder.path().join("photos")).unwrap();
+    let (images, assumptions) = found().unwrap();
+    assert_eq!(images[1], Some(folder.path().join("photos/b/second.png")));
+    assert_eq!(assumptions.len(), 2, "{assumptions:?}");
 }

@@ -1,5 +1,6 @@
 //! COLMAP's `.txt` files: an entry a line, and comments that start with `#`.
 
+use super::super::encodings::decoded;
 use super::super::limits::start;
 use super::entries::{CameraEntry, ImageEntry, Place};
 use super::models;
@@ -39,28 +40,31 @@ impl<'a> Words<'a> {
         })
     }
 
-    fn number(&mut self, member: &str) -> Result<f64> {
+    /// Reads a number, which may be infinite or NaN.
+    fn f64(&mut self, member: &str) -> Result<f64> {
         let word = self.word(member)?;
-        match word.parse::<f64>() {
-            Ok(value) if value.is_finite() => Ok(value),
-            _ => Err(self.error(member, format!("must be a finite number, is `{}`", start(word)))),
-        }
+        word.parse().map_err(|_| self.error(member, format!("must be a finite number, is `{}`", start(word))))
     }
 
-    fn numbers<const N: usize>(&mut self, member: &str) -> Result<[f64; N]> {
+    fn f64s<const N: usize>(&mut self, member: &str) -> Result<[f64; N]> {
         let mut values = [0.0; N];
         for value in &mut values {
-            *value = self.number(member)?;
+            *value = self.f64(member)?;
         }
         Ok(values)
+    }
+
+    fn number(&mut self, member: &str) -> Result<f64> {
+        match self.f64(member)? {
+            value if value.is_finite() => Ok(value),
+            value => Err(self.error(member, format!("must be a finite number, is {value}"))),
+        }
     }
 }
 
 /// The lines of a file, numbered from 1.
-fn lines<'a>(file: &'a Path, bytes: &'a [u8]) -> Result<impl Iterator<Item = Words<'a>>> {
-    let text = std::str::from_utf8(bytes).map_err(|e| Error::file(file, format!("is not UTF-8 text: {e}")))?;
-    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
-    Ok((1..).zip(text.lines()).map(move |(line, rest)| Words { file, place: Place::Line(line), rest: rest.trim() }))
+fn lines<'a>(file: &'a Path, text: &'a str) -> impl Iterator<Item = Words<'a>> {
+    (1..).zip(text.lines()).map(move |(line, rest)| Words { file, place: Place::Line(line), rest: rest.trim() })
 }
 
 /// Returns true unless a line is empty or a comment.
@@ -71,27 +75,32 @@ fn speaks(line: &Words<'_>) -> bool {
 pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
     let camera = |mut line: Words<'_>| {
         let id = line.integer("CAMERA_ID")?;
-        let model = models::by_name(line.word("MODEL")?).map_err(|what| line.error("MODEL", what))?;
+        let model = models::by_name(line.word("MODEL")?);
         let size = [line.integer("WIDTH")?, line.integer("HEIGHT")?];
-        let params = models::params(model).map(|name| line.number(name)).collect::<Result<Vec<f64>>>()?;
+        let model = match model {
+            Ok(model) => model,
+            Err(what) => return Ok(CameraEntry { place: line.place, id, camera: Err(line.error("MODEL", what)) }),
+        };
+        let params = models::params(model).map(|name| line.f64(name)).collect::<Result<Vec<f64>>>()?;
         if !line.rest.trim().is_empty() {
             return Err(line.error("PARAMS", format!("{} takes {}: remove the others", model.name, params.len())));
         }
-        let camera = models::camera(model, size, &params).map_err(|(member, what)| line.error(member, what))?;
+        let camera = models::camera(model, size, &params).map_err(|(member, what)| line.error(member, what));
         Ok(CameraEntry { place: line.place, id, camera })
     };
-    lines(file, bytes)?.filter(speaks).map(camera).collect()
+    lines(file, &decoded(bytes)).filter(speaks).map(camera).collect()
 }
 
 pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
-    let mut lines = lines(file, bytes)?;
+    let text = decoded(bytes);
+    let mut lines = lines(file, &text);
     let mut images = vec![];
     while let Some(mut line) = lines.next() {
         if !speaks(&line) {
             continue;
         }
         let id = line.integer("IMAGE_ID")?;
-        let (q, t) = (line.numbers("QVEC")?, line.numbers("TVEC")?);
+        let (q, t) = (line.f64s("QVEC")?, line.f64s("TVEC")?);
         let camera = line.integer("CAMERA_ID")?;
         // The name is the rest of the line, since it may contain spaces.
         images.push(ImageEntry::new(file, line.place, id, q, t, camera, line.rest.trim())?);
@@ -129,7 +138,7 @@ pub(super) fn points(file: &Path, bytes: &[u8]) -> Result<Vec<Point>> {
         }
         Ok(Point { position, color, error, views: u32::try_from(track / 2).unwrap_or(u32::MAX) })
     };
-    lines(file, bytes)?.filter(speaks).map(point).collect()
+    lines(file, &decoded(bytes)).filter(speaks).map(point).collect()
 }
 
 pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {

@@ -145,7 +145,7 @@ fn all_lens_coefficients_are_read() {
                 fields[name] = value;
                 move |d: &mut Value| set(d, &fields)
             };
-            fails(set_to(json!("0.1")), &[&format!("`{name}`: must be a finite number, is \"0.1\"")]);
+            fails(set_to(json!("0.1a")), &[&format!("`{name}`: must be a finite number, is \"0.1a\"")]);
             if own.get(name).is_some() {
                 assert_ne!(cameras(set_to(json!(0.15)))[0].lens, lens, "{model} {name}");
                 continue;
@@ -269,7 +269,7 @@ fn unsupported_camera_fields_are_named() {
 #[test]
 fn invalid_camera_numbers_are_named() {
     for name in ["fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "p2"] {
-        for value in ["NaN", "Infinity", "-Infinity", "[1]", "\"1\"", "{}", "1e999"] {
+        for value in ["NaN", "Infinity", "-Infinity", "[1]", "\"one\"", "{}", "1e999"] {
             let (folder, mut document) = (tempfile::tempdir().unwrap(), document());
             document[name] = json!(12345);
             let text = document.to_string().replace("12345", value);
@@ -316,4 +316,66 @@ fn missing_sizes_come_from_the_images() {
     says(&read(&document).unwrap_err().to_string(), &["`frames[2].file_path`: ", "1.png: cannot be decoded"]);
     set(&mut document, &json!({ "w": 16, "h": 12 }));
     assert_eq!(read(&document).unwrap(), [[16, 12]; 4], "headers are not read");
+}
+
+#[test]
+fn other_spellings_of_numbers_give_the_same_cameras() {
+    let plain = cameras(|_| {});
+    let names = [("fl_x", "fx"), ("fl_y", "fy"), ("w", "width"), ("h", "height")];
+    let renamed = cameras(|d| {
+        for (usual, other) in names {
+            d[other] = d[usual].clone();
+            remove(d, usual);
+        }
+    });
+    assert_eq!(renamed, plain);
+    let strings = cameras(|d| {
+        for name in ["fl_x", "fl_y", "cx", "cy", "w", "h"] {
+            d[name] = json!(format!(" {}", d[name]));
+        }
+        for row in d["frames"][0]["transform_matrix"].as_array_mut().unwrap() {
+            row.as_array_mut().unwrap().iter_mut().for_each(|value| *value = json!(value.to_string()));
+        }
+    });
+    assert_eq!(strings, plain);
+}
+
+#[test]
+fn intrinsic_matrices_are_read_in_all_forms() {
+    let plain = cameras(|_| {});
+    let rows = json!([[100.0, 0, 31.0], [0, 110.0, 25.0], [0, 0, 1]]);
+    let columns = json!([[100.0, 0, 0], [0, 110.0, 0], [31.0, 25.0, 1]]);
+    let flat = json!([100.0, 0, 31.0, 0, "110.0", 25.0, 0, 0, 1]);
+    let lengths = ["fl_x", "fl_y", "cx", "cy"];
+    for name in ["K", "intrinsics", "camera_intrinsics", "intrinsic_matrix", "camera_matrix"] {
+        for matrix in [&rows, &columns, &flat] {
+            let at_top = cameras(|d| {
+                lengths.iter().for_each(|length| remove(d, length));
+                d[name] = matrix.clone();
+            });
+            assert_eq!(at_top, plain, "{name} {matrix}");
+        }
+    }
+    let of_frame = cameras(|d| d["frames"][1]["K"] = json!([[90, 0, 30], [0, 95, 20], [0, 0, 1]]));
+    assert_eq!(of_frame[0], plain[0]);
+    assert_eq!((of_frame[1].focal, of_frame[1].centre), ([90.0, 95.0], [30.0, 20.0]));
+    // The same lengths twice.
+    assert_eq!(cameras(|d| d["K"] = rows.clone()), plain);
+    fails(
+        |d| d["K"] = json!([[101, 0, 31], [0, 110, 25], [0, 0, 1]]),
+        &["`fl_x`: is 100", "matrix has 101: remove one"],
+    );
+    fails(|d| d["K"] = json!([[100, 0, 31], [0, 110, 26], [0, 0, 1]]), &["`cy`: is 25", "matrix has 26: remove one"]);
+    for matrix in [
+        json!([[100, 1, 31], [0, 110, 25], [0, 0, 1]]),
+        json!([[100, 0, 31], [0, 110, 25], [1, 0, 1]]),
+        json!([[100, 0, 31], [0, 110, 25], [0, 0, 2]]),
+    ] {
+        fails(|d| d["K"] = matrix, &["`K`: must have the rows fx 0 cx, 0 fy cy and 0 0 1"]);
+    }
+    for matrix in [json!([]), json!([[100, 0, 31], [0, 110, 25]]), json!([1, 2, "x", 4, 5, 6, 7, 8, 9]), json!([[1]])] {
+        fails(|d| d["K"] = matrix, &["`K`: must be a 3x3 intrinsic matrix"]);
+    }
+    // Other programs' members of these names.
+    assert_eq!(cameras(|d| d["intrinsics"] = json!({ "fx": 1 })), plain);
 }

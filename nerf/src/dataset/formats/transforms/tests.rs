@@ -92,8 +92,14 @@ fn invalid_poses_are_named() {
     bad(json!([[1, 0, 0, null], [0, 1, 0, 0], [0, 0, 1, 0]]), "row 0, column 3 is not a finite number: null");
     for value in ["NaN", "Infinity", "-Infinity"] {
         let folder = folder(|_| {});
-        let text = document().to_string().replacen("4.0", value, 1);
-        std::fs::write(folder.path().join(FILE), text).unwrap();
+        let text = document().to_string();
+        std::fs::write(folder.path().join(FILE), text.replacen("4.0", value, 1)).unwrap();
+        let capture = read(folder.path()).unwrap();
+        assert_eq!((capture.views.len(), capture.views[0].name.as_str()), (2, "images/1.png"));
+        let expected = "left out 1 of 3 frames without a finite pose, such as `images/0.png`";
+        assert_eq!(capture.assumptions, [expected]);
+        // Most frames must be whole.
+        std::fs::write(folder.path().join(FILE), text.replacen("4.0", value, 2)).unwrap();
         let expected = format!("row 2, column 3 is not a finite number: \"{value}\"");
         says(&failure(read(folder.path()), FILE), &["`frames[0].transform_matrix`", &expected]);
     }
@@ -297,4 +303,79 @@ fn damaged_transforms_files_are_named() {
             Err(error) => damage::clear(error, folder.path().to_str().unwrap()),
         }
     });
+}
+
+#[test]
+fn matrices_may_be_flat_but_not_transposed_or_mirrored() {
+    let poses = |matrix: &Value| good(|d| d["frames"][0]["transform_matrix"] = matrix.clone()).views[0].camera.pose;
+    let rows = json!([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]]);
+    let flat = json!([0.0, -1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 1.0, 3.0]);
+    let mut long = flat.clone();
+    long.as_array_mut().unwrap().extend([json!(0), json!(0), json!(0), json!(1)]);
+    assert_eq!(poses(&flat), poses(&rows));
+    assert_eq!(poses(&long), poses(&rows));
+    let columns = json!([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]]);
+    let flat_columns = json!([0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 1, 2, 3, 1]);
+    for matrix in [columns, flat_columns] {
+        fails(
+            |d| d["frames"][0]["transform_matrix"] = matrix,
+            &["is transposed: its last column is 0 0 0 1 and its last row 1 2 3 1; write rows", "ARKit and three.js"],
+        );
+    }
+    let mirrored = json!([[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, -1, 3]]);
+    fails(|d| d["frames"][0]["transform_matrix"] = mirrored, &["left-handed axes, as in Unity and Unreal"]);
+    for matrix in [json!([1, 2, 3]), json!([0, 0, 0, 0, 0]), json!([[1, 0, 0, 0], 0, 0, 0])] {
+        fails(|d| d["frames"][0]["transform_matrix"] = matrix, &["must be 3 or 4 rows of 4 numbers"]);
+    }
+}
+
+#[test]
+fn utf16_gives_the_same_capture() {
+    let folder = folder(|_| {});
+    let plain = read(folder.path()).unwrap();
+    let text = document().to_string();
+    let bytes: Vec<u8> = [0xff, 0xfe].into_iter().chain(text.encode_utf16().flat_map(u16::to_le_bytes)).collect();
+    std::fs::write(folder.path().join(FILE), bytes).unwrap();
+    assert_eq!(read(folder.path()).unwrap(), plain);
+}
+
+#[test]
+fn images_masks_and_depths_of_another_machine_are_found() {
+    let moved = |path: &str| format!("C:\\captures\\scene\\{path}");
+    let folder = folder(|d| {
+        for (i, frame) in d["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
+            frame["file_path"] = json!(moved(&format!("images\\{i}.jpg")));
+            frame["mask_path"] = json!(moved(&format!("masks\\{i}.png")));
+            frame["depth_file_path"] = json!(moved(&format!("depth\\{i}.png")));
+        }
+    });
+    let at = |name: &str| folder.path().join(name);
+    for name in ["masks/0.png", "masks/1.png", "depth/0.png", "depth/1.png"] {
+        picture(&at(name), 8, 6);
+    }
+    let capture = read(folder.path()).unwrap();
+    for (i, view) in capture.views[..2].iter().enumerate() {
+        let files =
+            [&view.image, &view.mask, &view.depth.clone().map(|(path, _)| path)].map(|file| file.clone().unwrap());
+        assert_eq!(files, ["images", "masks", "depth"].map(|name| at(&format!("{name}/{i}.png"))));
+    }
+    assert_eq!(capture.views[2].image, None);
+    let expected = "`C:/captures/scene/images/0.jpg` does not exist: used `images/0.png`, and 1 file likewise";
+    assert_eq!((capture.assumptions.len(), capture.assumptions[0].as_str()), (3, expected));
+    // Two images that fit.
+    picture(&at("images/0.webp"), 8, 6);
+    says(&failure(read(folder.path()), FILE), &["`frames[0].file_path`", "`images/0.png` and `images/0.webp` fit"]);
+}
+
+#[test]
+fn downscaled_images_keep_the_scale_of_focal_lengths() {
+    let folder = folder(|d| {
+        remove(d, "w");
+        remove(d, "h");
+    });
+    let camera = |folder: &Path| read(folder).unwrap().views[0].camera.clone();
+    let plain = camera(folder.path());
+    std::fs::remove_dir_all(folder.path().join("images")).unwrap();
+    picture(&folder.path().join("images_2/0.png"), 4, 3);
+    assert_eq!(camera(folder.path()), plain);
 }

@@ -127,7 +127,6 @@ fn unwritable_colmap_captures_are_named() {
     let camera = |change: &dyn Fn(&mut Camera), expected: &str| {
         fails(&|capture| change(&mut capture.views[1].camera), Encoding::Binary, &format!("`frames[b.png].{expected}"));
     };
-    camera(&|c| c.lens = Lens::Equirectangular, "camera`: is equirectangular");
     camera(&|c| c.lens = Lens::Fov { omega: 4.0 }, "camera`: omega: must be below pi (radians)");
     camera(&|c| c.lens = Lens::Brown { k: [f64::NAN; 6], p: [0.0; 2] }, "camera`: k1: must be a finite number");
     camera(&|c| c.focal[1] = 0.0, "camera`: focal length: must be more than 0");

@@ -1,0 +1,239 @@
+//! Finds the files of a capture that was moved or renamed after its description was written.
+//!
+//! A listed path counts as it stands. If no file of a listed folder exists, the folder with the longest common end of
+//! the path takes its place. Letter case and the extension of an image may differ. Two folders or files that fit
+//! equally well are an error.
+
+use super::paths::{self, extension};
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::ffi::OsString;
+use std::path::{Component, Path, PathBuf};
+
+/// The deepest folder that is searched, and the most entries.
+const DEEPEST: usize = 5;
+const MOST_ENTRIES: usize = 200_000;
+
+/// Names of folders with the images of a split. Those of one split never take the place of another's.
+const SPLITS: [&str; 4] = ["train", "val", "eval", "test"];
+/// Words in the names of folders with other files than images.
+const LAYERS: [&str; 4] = ["mask", "depth", "normal", "segment"];
+
+/// A file of a capture.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Located {
+    pub(super) path: PathBuf,
+    /// The factor of a folder of downscaled images, such as `images_4`, that took the place of `images`; otherwise 1.
+    pub(super) factor: usize,
+}
+
+/// A name's index and a message.
+pub(super) type Ambiguity = (usize, String);
+
+/// Finds the files with these names, relative to `folder`; `None` for those that do not exist.
+///
+/// Adds a sentence to `assumptions` for each listed folder whose files were found elsewhere.
+///
+/// # Errors
+/// If two files fit a name, or a file fits two names.
+pub(super) fn locate(
+    folder: &Path,
+    names: &[&str],
+    assumptions: &mut Vec<String>,
+) -> Result<Vec<Option<Located>>, Ambiguity> {
+    let exact = |name: &&str| paths::find(folder, name).map(|path| Located { path, factor: 1 });
+    let mut found: Vec<Option<Located>> = names.iter().map(exact).collect();
+    let listed: Vec<[&str; 2]> = names.iter().map(|name| split(name)).collect();
+    let existing: HashSet<&str> = (0..names.len()).filter(|&i| found[i].is_some()).map(|i| listed[i][0]).collect();
+    let mut groups: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
+    for i in (0..names.len()).filter(|&i| found[i].is_none()) {
+        groups.entry(listed[i][0]).or_default().push(i);
+    }
+    // Files with an owner take no other name's place.
+    let exact: HashSet<PathBuf> = found.iter().flatten().map(|file| file.path.clone()).collect();
+    let mut owners: HashMap<PathBuf, usize> = HashMap::new();
+    let mut tree = None;
+    for (place, group) in groups {
+        let directories = match existing.contains(place) {
+            true => vec![Directory::read(folder, Path::new(place))],
+            false => {
+                let tree = tree.get_or_insert_with(|| walk(folder));
+                let holds_any = |directory: &&Directory| group.iter().any(|&i| !directory.of(listed[i][1]).is_empty());
+                best(folder, place, tree.iter().filter(holds_any))
+            }
+        };
+        let (mut first, mut count) = (None, 0);
+        for i in group {
+            let mut fitting: Vec<(&Directory, &OsString)> = directories
+                .iter()
+                .flat_map(|directory| directory.of(listed[i][1]).into_iter().map(move |file| (directory, file)))
+                .filter(|(directory, file)| !exact.contains(&folder.join(&directory.inside).join(file)))
+                .collect();
+            let Some((directory, file)) = fitting.pop() else { continue };
+            let inside = directory.inside.join(file);
+            if let Some((other, file)) = fitting.pop() {
+                let other = other.inside.join(file);
+                let [one, two] = [&other, &inside].map(|path| path.display());
+                let what = format!("`{}` does not exist; `{one}` and `{two}` fit: correct the path", names[i]);
+                return Err((i, what));
+            }
+            if let Some(&other) = owners.get(&inside).filter(|&&other| names[other] != names[i]) {
+                let (one, two, file) = (names[other], names[i], inside.display());
+                let what = format!("`{one}` and `{two}` do not exist; `{file}` fits both: correct the paths");
+                return Err((i, what));
+            }
+            owners.insert(inside.clone(), i);
+            first.get_or_insert_with(|| (i, inside.display().to_string()));
+            count += 1;
+            found[i] = Some(Located { path: folder.join(inside), factor: factor_of(&directory.inside) });
+        }
+        if let Some((i, file)) = first {
+            let rest = match count - 1 {
+                0 => String::new(),
+                1 => ", and 1 file likewise".to_owned(),
+                others => format!(", and {others} files likewise"),
+            };
+            assumptions.push(format!("`{}` does not exist: used `{file}`{rest}", names[i]));
+        }
+    }
+    Ok(found)
+}
+
+/// A path's folder and file name.
+fn split(path: &str) -> [&str; 2] {
+    let (place, name) = path.rsplit_once('/').unwrap_or(("", path));
+    [place, name]
+}
+
+/// A file name in lower case, without the extension of an image.
+fn stem(name: &str) -> String {
+    let ending = extension(name).map_or(0, |ending| ending.len() + 1);
+    name[..name.len() - ending].to_lowercase()
+}
+
+/// The files of a folder.
+#[derive(Clone)]
+struct Directory {
+    /// The path below the capture's folder.
+    inside: PathBuf,
+    /// The names of the files with a stem.
+    files: HashMap<String, Vec<OsString>>,
+}
+
+impl Directory {
+    fn new(inside: PathBuf, names: Vec<OsString>) -> Self {
+        let mut files: HashMap<String, Vec<OsString>> = HashMap::new();
+        for name in names {
+            files.entry(stem(&name.to_string_lossy())).or_default().push(name);
+        }
+        Directory { inside, files }
+    }
+
+    /// Reads a single folder, which counts as empty if it cannot be read.
+    fn read(folder: &Path, inside: &Path) -> Self {
+        let entries = std::fs::read_dir(folder.join(inside)).into_iter().flatten().flatten().take(MOST_ENTRIES);
+        let mut names: Vec<OsString> = entries.map(|entry| entry.file_name()).filter(|name| !is_hidden(name)).collect();
+        names.retain(|name| folder.join(inside).join(name).is_file());
+        names.sort();
+        Directory::new(inside.to_owned(), names)
+    }
+
+    /// The files that fit a name best: of the same name, or else in other letter case, or else with the extension of
+    /// another image format.
+    fn of(&self, name: &str) -> Vec<&OsString> {
+        let all = self.files.get(&stem(name)).map_or(&[][..], Vec::as_slice);
+        let fits = |test: &dyn Fn(&str) -> bool| -> Vec<&OsString> {
+            all.iter().filter(|file| test(&file.to_string_lossy())).collect()
+        };
+        let is_image = |file: &str| extension(file).is_some();
+        let rules: [&dyn Fn(&str) -> bool; 3] =
+            [&|file| file == name, &|file| file.to_lowercase() == name.to_lowercase(), &is_image];
+        rules.into_iter().map(fits).find(|files| !files.is_empty()).unwrap_or_default()
+    }
+}
+
+fn is_hidden(name: &std::ffi::OsStr) -> bool {
+    name.as_encoded_bytes().starts_with(b".")
+}
+
+/// All folders below `folder`, itself included, in the order of their paths. Hidden entries are left out.
+fn walk(folder: &Path) -> Vec<Directory> {
+    let (mut out, mut seen, mut entries) = (vec![], HashSet::new(), 0);
+    let mut waiting = VecDeque::from([(PathBuf::new(), 0)]);
+    while let Some((inside, depth)) = waiting.pop_front() {
+        let here = folder.join(&inside);
+        // Links may form cycles. They come last, so that folders keep their own names.
+        if !here.canonicalize().is_ok_and(|path| seen.insert(path)) {
+            continue;
+        }
+        let mut names = vec![];
+        for entry in std::fs::read_dir(&here).into_iter().flatten().flatten() {
+            entries += 1;
+            let name = entry.file_name();
+            if entries > MOST_ENTRIES {
+                break;
+            }
+            if is_hidden(&name) {
+                continue;
+            }
+            match here.join(&name) {
+                path if path.is_file() => names.push(name),
+                path if path.is_symlink() && depth < DEEPEST => waiting.push_back((inside.join(name), depth + 1)),
+                path if path.is_dir() && depth < DEEPEST => waiting.push_front((inside.join(name), depth + 1)),
+                _ => {}
+            }
+        }
+        names.sort();
+        out.push(Directory::new(inside, names));
+    }
+    out.sort_by(|a, b| a.inside.cmp(&b.inside));
+    out
+}
+
+/// The folders whose paths have the longest common end with `place`; several if they are equally long.
+///
+/// A folder `images_4` counts as `images`, after folders of full size; the least downscaled counts.
+fn best<'a>(folder: &Path, place: &str, directories: impl Iterator<Item = &'a Directory>) -> Vec<Directory> {
+    let root = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
+    let wanted: Vec<String> = place.split('/').filter(|part| !matches!(*part, "" | "." | "..")).map(lower).collect();
+    let splits = |parts: &[String]| SPLITS.map(|split| parts.iter().any(|part| part == split));
+    let layers = |parts: &[String]| LAYERS.map(|layer| parts.iter().any(|part| part.contains(layer)));
+    let rate = |directory: &Directory| {
+        let own = parts(&directory.inside);
+        let is_of_split = splits(&own).iter().zip(splits(&wanted)).all(|(own, wanted)| *own <= wanted);
+        let is_of_kind = is_of_split && layers(&own) == layers(&wanted);
+        let path = [parts(&root), own].concat();
+        let common = path.iter().rev().zip(wanted.iter().rev()).take_while(|(a, b)| a == b).count();
+        is_of_kind.then_some((common, Reverse(factor_of(&directory.inside))))
+    };
+    let rated: Vec<_> = directories.filter_map(|directory| Some((rate(directory)?, directory))).collect();
+    let most = rated.iter().map(|(rating, _)| *rating).max();
+    rated.into_iter().filter(|(rating, _)| Some(*rating) == most).map(|(_, directory)| directory.clone()).collect()
+}
+
+fn lower(part: &str) -> String {
+    let part = part.to_lowercase();
+    match part.rsplit_once('_') {
+        Some(("images", factor)) if factor.parse::<usize>().is_ok() => "images".to_owned(),
+        _ => part,
+    }
+}
+
+/// The parts of a path in lower case, without the factor of downscaled images.
+fn parts(path: &Path) -> Vec<String> {
+    path.components()
+        .filter_map(|part| match part {
+            Component::Normal(part) => Some(lower(&part.to_string_lossy())),
+            _ => None,
+        })
+        .collect()
+}
+
+/// The factor of a folder of downscaled images, such as `images_4`; 1 for other folders.
+fn factor_of(inside: &Path) -> usize {
+    let name = inside.components().next().map_or_else(Default::default, |part| part.as_os_str().to_string_lossy());
+    name.strip_prefix("images_").and_then(|factor| factor.parse().ok()).filter(|factor| *factor > 0).unwrap_or(1)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,144 @@
+use super::*;
+
+/// A folder `scene` with these files.
+fn scene(files: &[&str]) -> (tempfile::TempDir, PathBuf) {
+    let parent = tempfile::tempdir().unwrap();
+    let folder = parent.path().join("scene");
+    std::fs::create_dir(&folder).unwrap();
+    for file in files {
+        let path = folder.join(file);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, b"").unwrap();
+    }
+    (parent, folder)
+}
+
+/// The files that are found, below the folder, and the assumptions; or the name's index and the message.
+fn found(files: &[&str], names: &[&str]) -> Result<(Vec<Option<String>>, Vec<String>), Ambiguity> {
+    let (_parent, folder) = scene(files);
+    let mut assumptions = vec![];
+    let inside = |file: Located| file.path.strip_prefix(&folder).unwrap().to_str().unwrap().to_owned();
+    let located = locate(&folder, names, &mut assumptions)?;
+    Ok((located.into_iter().map(|file| file.map(inside)).collect(), assumptions))
+}
+
+#[track_caller]
+fn finds(files: &[&str], names: &[&str], expected: &[&str]) {
+    let (paths, assumptions) = found(files, names).unwrap();
+    let paths: Vec<&str> = paths.iter().map(|path| path.as_deref().unwrap_or("")).collect();
+    assert_eq!(paths, expected);
+    let is_moved = paths.iter().zip(names).any(|(path, name)| !path.is_empty() && path != name);
+    assert_eq!(assumptions.len(), usize::from(is_moved), "{assumptions:?}");
+}
+
+#[track_caller]
+fn refuses(files: &[&str], names: &[&str], parts: &[&str]) {
+    let (_, what) = found(files, names).unwrap_err();
+    parts.iter().for_each(|part| assert!(what.contains(part), "no `{part}` in: {what}"));
+}
+
+#[test]
+fn listed_files_come_first() {
+    finds(&["images/0.png", "other/0.png"], &["images/0.png", "other/0.png"], &["images/0.png", "other/0.png"]);
+    finds(&["images/0.png"], &["images/0.png", "images/1.png"], &["images/0.png", ""]);
+}
+
+#[test]
+fn folders_are_found_by_the_end_of_the_path() {
+    let files = ["images/frame_1.jpg", "images/frame_2.jpg", "transforms.json"];
+    for place in ["../slike", "C:/data", "/home/someone/data/images", "scene/images", "scene", "", "a/b/images"] {
+        let names = ["frame_1.jpg", "frame_2.jpg"].map(|name| format!("{place}/{name}"));
+        let names = names.each_ref().map(|name| name.trim_start_matches('/'));
+        let names =
+            if place.starts_with('/') { names.map(|name| format!("/{name}")) } else { names.map(str::to_owned) };
+        finds(&files, &names.each_ref().map(String::as_str), &["images/frame_1.jpg", "images/frame_2.jpg"]);
+    }
+    // The capture's own folder.
+    finds(&["0.jpg", "b/0.jpg"], &["/home/someone/scene/0.jpg"], &["0.jpg"]);
+    // Cameras with images of the same names.
+    let files = ["images/cam1/0.png", "images/cam2/0.png"];
+    finds(&files[1..], &["D:/x/cam2/0.png"], &["images/cam2/0.png"]);
+    let (paths, assumptions) = found(&files, &["D:/x/cam1/0.png", "D:/x/cam2/0.png"]).unwrap();
+    assert_eq!(paths, files.map(|file| Some(file.to_owned())));
+    assert_eq!(assumptions.len(), 2, "one for each folder: {assumptions:?}");
+}
+
+#[test]
+fn letter_case_and_extension_may_differ() {
+    finds(&["Images/IMG_1.JPG"], &["images/img_1.jpg"], &["Images/IMG_1.JPG"]);
+    finds(&["images/a.png", "images/b.png"], &["images/a.jpg", "images/b.jpg"], &["images/a.png", "images/b.png"]);
+    finds(&["images/a.png", "images/B.jpeg"], &["images/a.png", "images/b.jpg"], &["images/a.png", "images/B.jpeg"]);
+    // The same extension comes first.
+    finds(&["images/A.jpg", "images/a.png"], &["images/a.JPG"], &["images/A.jpg"]);
+    // Names without an extension, as Blender writes them.
+    finds(&["images/r_0.png"], &["./x/r_0"], &["images/r_0.png"]);
+}
+
+#[test]
+fn ambiguous_files_are_refused() {
+    refuses(
+        &["a/0.png", "b/0.png"],
+        &["images/0.png"],
+        &["`images/0.png` does not exist", "`a/0.png` and `b/0.png` fit"],
+    );
+    refuses(&["images/0.png", "images/0.webp"], &["x/0.jpg"], &["`images/0.png` and `images/0.webp` fit"]);
+    refuses(&["images/A.jpg", "images/a.jpg"], &["x/a.JPG"], &["`images/A.jpg` and `images/a.jpg` fit"]);
+    let what = ["`left/0.png` and `right/0.png` do not exist", "`images/0.png` fits both"];
+    refuses(&["images/0.png"], &["left/0.png", "right/0.png"], &what);
+    assert_eq!(found(&["a/1.png", "b/1.png"], &["images/0.png", "images/1.png"]).unwrap_err().0, 1);
+    // The same name twice is no ambiguity.
+    assert!(found(&["images/0.png"], &["x/0.png", "x/0.png"]).is_ok());
+}
+
+#[test]
+fn files_of_another_kind_take_no_place() {
+    let absent = |files: &[&str], names: &[&str]| finds(files, names, &vec![""; names.len()]);
+    absent(&["test/r_0.png"], &["train/r_0.png"]);
+    absent(&["val/r_0.png", "test/r_0.png"], &["train/r_0.png"]);
+    absent(&["masks/0.png", "depth/0.png", "normals/0.png", "segmentation/0.png"], &["images/0.jpg"]);
+    absent(&["images/0.png"], &["masks/0.png"]);
+    absent(&[".thumbnails/0.png", "images/._0.png"], &["images/0.png"]);
+    absent(&["images/00.png", "images/0.txt"], &["images/0.png"]);
+    // A listed folder of which a file exists is the right one.
+    finds(&["images/0.png", "old/1.png"], &["images/0.png", "images/1.png"], &["images/0.png", ""]);
+    // A file that another name lists.
+    finds(&["images/0.png", "x/1.png"], &["images/0.png", "y/0.png"], &["images/0.png", ""]);
+    finds(&["masks/0.png", "images/0.png"], &["C:/x/masks/0.png"], &["masks/0.png"]);
+    finds(&["set/train/0.png", "set/test/0.png"], &["C:/x/train/0.png"], &["set/train/0.png"]);
+}
+
+#[test]
+fn downscaled_images_count_after_those_of_full_size() {
+    finds(&["images_4/0.png", "photos/0.png"], &["frames/0.png"], &["photos/0.png"]);
+    finds(&["images_8/0.png", "images_4/0.png"], &["images/0.jpg"], &["images_4/0.png"]);
+    let (_parent, folder) = scene(&["images_4/0.png"]);
+    let located = locate(&folder, &["images/0.png"], &mut vec![]).unwrap();
+    assert_eq!(located[0].as_ref().unwrap().factor, 4);
+    let located = locate(&folder, &["images_4/0.png"], &mut vec![]).unwrap();
+    assert_eq!(located[0].as_ref().unwrap().factor, 1, "as listed");
+}
+
+#[test]
+fn assumptions_name_the_first_file_and_count_the_others() {
+    let of = |files: &[&str], names: &[&str]| found(files, names).unwrap().1;
+    assert_eq!(of(&["images/0.png"], &["x/0.jpg"]), ["`x/0.jpg` does not exist: used `images/0.png`"]);
+    let files = ["images/0.png", "images/1.png", "images/2.png"];
+    let expected = ["`x/0.jpg` does not exist: used `images/0.png`, and 2 files likewise"];
+    assert_eq!(of(&files, &["x/0.jpg", "x/1.jpg", "x/2.jpg", "x/3.jpg"]), expected);
+}
+
+#[cfg(unix)]
+#[test]
+fn names_that_are_not_utf8_and_links_are_found() {
+    use std::os::unix::ffi::OsStrExt;
+    let (_parent, folder) = scene(&["images/0.png"]);
+    let name = std::ffi::OsStr::from_bytes(b"caf\xe9.jpg");
+    std::fs::write(folder.join("images").join(name), b"").unwrap();
+    let located = locate(&folder, &["images/0.png", "images/caf\u{fffd}.jpg"], &mut vec![]).unwrap();
+    assert_eq!(located[1].as_ref().unwrap().path, folder.join("images").join(name));
+    // A folder that contains a link to itself.
+    std::os::unix::fs::symlink(&folder, folder.join("images/again")).unwrap();
+    std::os::unix::fs::symlink(folder.join("images"), folder.join("photos")).unwrap();
+    let located = locate(&folder, &["x/0.png"], &mut vec![]).unwrap();
+    assert_eq!(located[0].as_ref().unwrap().path, folder.join("images/0.png"), "found once");
+}
