@@ -71,23 +71,31 @@ impl LoadOptions<'_> {
 impl Capture {
     /// Reads the cameras of a folder in any [format](super::formats), without decoding images.
     ///
+    /// `path` may also be a file that describes a capture: a `.json` file, `poses_bounds.npy`, or a file of a COLMAP
+    /// model. If a folder holds several descriptions, the one with most existing images counts; of equally many, the
+    /// first of `transforms.json`, Blender, COLMAP and LLFF. [`assumptions`](Self::assumptions) states the choice.
+    ///
     /// Without splits in the files, every eighth image by name, from the first, is a [test](Split::Test) image, even if
     /// its file does not exist. The others are training images. If the files list only training images, the others are
     /// test images.
     ///
     /// # Errors
-    /// If the folder is absent or has no known format, a file has a bad field, or an image is in both the training and
+    /// If the path is absent or has no known format, a file has a bad field, or an image is in both the training and
     /// the test split.
-    pub fn read(folder: impl AsRef<Path>) -> Result<Capture> {
-        let folder = folder.as_ref();
-        if !folder.is_dir() {
-            let what = match folder.exists() {
-                true => "is not a folder: name the folder that holds it",
-                false => "there is no such folder",
-            };
-            return Err(Error::file(folder, what));
+    pub fn read(path: impl AsRef<Path>) -> Result<Capture> {
+        Capture::read_format(path, None)
+    }
+
+    /// [`read`](Self::read) for a folder with a description in this format.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read), or if there is no description in the format.
+    pub fn read_format(path: impl AsRef<Path>, format: Option<Format>) -> Result<Capture> {
+        let path = path.as_ref();
+        if !path.exists() {
+            return Err(Error::file(path, "there is no such folder"));
         }
-        let mut capture = formats::read(folder)?;
+        let mut capture = formats::read(path, format)?;
         capture.hold_out();
         capture.check_splits()?;
         Ok(capture)

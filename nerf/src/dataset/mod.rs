@@ -93,7 +93,7 @@ mod tests {
         fails(folder.path(), "is not a dataset");
         let file = folder.path().join("transforms.json");
         std::fs::write(&file, "{}").unwrap();
-        fails(&file, "is not a folder");
+        fails(&file, "`frames`: is missing");
         fails(folder.path(), "`frames`: is missing");
         let images = folder.path().join("images");
         std::fs::create_dir(&images).unwrap();

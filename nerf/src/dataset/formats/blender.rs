@@ -23,13 +23,14 @@ fn file_of(folder: &Path, split: Split) -> PathBuf {
     folder.join(name_of(split))
 }
 
-fn name_of(split: Split) -> String {
+/// The name of that file.
+pub(super) fn name_of(split: Split) -> String {
     format!("transforms_{split}.json")
 }
 
-/// Returns true if the folder contains a file of this format.
-pub(crate) fn detect(folder: &Path) -> bool {
-    Split::ALL.into_iter().any(|split| file_of(folder, split).is_file())
+/// The first existing file of a capture's folder.
+pub(super) fn file(folder: &Path) -> Option<PathBuf> {
+    Split::ALL.into_iter().map(|split| file_of(folder, split)).find(|file| file.is_file())
 }
 
 /// Reads the files of all splits, in the order train, val, test.

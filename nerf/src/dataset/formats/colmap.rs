@@ -24,43 +24,68 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use table::Table;
 
+pub(super) use beside::root;
 pub use encoding::Encoding;
 
-/// Possible folders of a model within a capture, in the order of the search.
-const PLACES: [&str; 4] = ["sparse/0", "sparse", "", "colmap/sparse/0"];
+/// Folders of models within a capture, in the order of the search. In those of `true`, each model has a folder with its
+/// number.
+const PLACES: [(&str, bool); 5] =
+    [("sparse", true), ("sparse", false), ("", false), ("colmap/sparse", true), ("distorted/sparse", true)];
 
-/// The folder and the encoding of a capture's model.
-fn find(folder: &Path) -> Option<(PathBuf, Encoding)> {
-    let folders = PLACES.iter().map(|place| if place.is_empty() { folder.to_owned() } else { folder.join(place) });
-    let all = folders.flat_map(|folder| Encoding::ALL.map(|encoding| (folder.clone(), encoding)));
-    all.into_iter().find(|(folder, encoding)| {
-        let [cameras, images, _] = encoding.files(folder);
-        cameras.is_file() && images.is_file()
-    })
+/// The files of images of all models in a capture's folder.
+pub(super) fn models(folder: &Path) -> Vec<PathBuf> {
+    let mut folders = vec![];
+    for (place, is_numbered) in PLACES {
+        let place = if place.is_empty() { folder.to_owned() } else { folder.join(place) };
+        if !is_numbered {
+            folders.push(place);
+            continue;
+        }
+        let names = std::fs::read_dir(&place).into_iter().flatten().flatten().map(|entry| entry.file_name());
+        let mut numbers: Vec<u64> = names.filter_map(|name| name.to_str()?.parse().ok()).collect();
+        numbers.sort_unstable();
+        folders.extend(numbers.into_iter().map(|number| place.join(number.to_string())));
+    }
+    let file = |folder: PathBuf| {
+        let files = Encoding::ALL.into_iter().map(|encoding| encoding.files(&folder));
+        files
+            .into_iter()
+            .find(|[cameras, images, _]| cameras.is_file() && images.is_file())
+            .map(|[_, images, _]| images)
+    };
+    folders.into_iter().filter_map(file).collect()
 }
 
-/// Returns true if the folder contains cameras in this format.
-pub(crate) fn detect(folder: &Path) -> bool {
-    find(folder).is_some()
+/// The file of images of the model that a file is part of.
+pub(super) fn images_beside(file: &Path) -> Option<PathBuf> {
+    let mut files = Encoding::ALL.into_iter().map(|encoding| encoding.files(file.parent().unwrap_or(Path::new(""))));
+    files.find(|files| files.iter().any(|other| other == file)).map(|[_, images, _]| images)
 }
 
 /// Reads the cameras and points of `folder`, views in the order of their names. No image is decoded.
 ///
 /// # Errors
 /// If a file is absent or damaged, an image has no camera, an identifier or name is duplicated, a camera model is not
-/// supported, or a number is not finite. The error names the file and the entry or line.
+/// supported, or a number is not finite. The error names the file and the entry or line. Single images with an invalid
+/// camera or pose are no error: they are left out with an [assumption](Capture::assumptions).
 pub fn read(folder: &Path) -> Result<Capture> {
-    let Some((model, encoding)) = find(folder) else {
-        let what = "has no COLMAP model: expected cameras.bin and images.bin, or both as .txt, in sparse/0";
-        return Err(Error::file(folder, what));
-    };
-    let files = encoding.files(&model);
+    let what = "has no COLMAP model: expected cameras.bin and images.bin, or both as .txt, in sparse/0";
+    let model = models(folder).into_iter().next().ok_or_else(|| Error::file(folder, what))?;
+    read_model(folder, &model)
+}
+
+/// Reads the model with this file of images.
+pub(super) fn read_model(folder: &Path, images: &Path) -> Result<Capture> {
+    let model = images.parent().unwrap_or(folder);
+    let is_own = |encoding: &Encoding| encoding.files(model)[1] == images;
+    let encoding = Encoding::ALL.into_iter().find(is_own).unwrap_or(Encoding::Binary);
+    let files = encoding.files(model);
     let content = |file: &Path| std::fs::read(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")));
     let [cameras, images, points] = &files;
     // Models with known cameras may have no points.
     let points = if points.is_file() { Some(content(points)?) } else { None };
     let mut capture = parse(folder, encoding, &files, [&content(cameras)?, &content(images)?], points.as_deref())?;
-    beside::attach(&mut capture, &model)?;
+    beside::attach(&mut capture, model)?;
     Ok(capture)
 }
 

@@ -19,9 +19,9 @@ const FILE: &str = "poses_bounds.npy";
 const COLUMNS: usize = 17;
 const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
-/// Returns true if the folder contains cameras in this format.
-pub(crate) fn detect(folder: &Path) -> bool {
-    folder.join(FILE).is_file()
+/// The file of a capture's folder.
+pub(super) fn file(folder: &Path) -> PathBuf {
+    folder.join(FILE)
 }
 
 /// Reads the cameras of `folder`. No image is decoded.
@@ -30,14 +30,14 @@ pub(crate) fn detect(folder: &Path) -> bool {
 /// If a file is absent or damaged, the numbers of images and cameras differ, or a number is not valid for a camera. The
 /// error names the file and the row, counted from 0.
 pub fn read(folder: &Path) -> Result<Capture> {
-    let file = folder.join(FILE);
+    let file = file(folder);
     let bytes = std::fs::read(&file).map_err(|e| Error::file(&file, format!("cannot be read: {e}")))?;
     parse(folder, &bytes, images(folder)?)
 }
 
 /// [`read`] for the bytes of the file and the images of the folder.
 fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<Capture> {
-    let file = folder.join(FILE);
+    let file = file(folder);
     let matrix = Matrix::read(bytes).map_err(|what| Error::file(&file, what))?;
     let shape = |what: String| Error::field(&file, "shape", what);
     if matrix.columns != COLUMNS {

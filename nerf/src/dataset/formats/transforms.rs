@@ -15,16 +15,16 @@ use crate::files::write_atomic;
 use glam::DAffine3;
 use serde_json::{Map, Value};
 use std::collections::{HashMap, HashSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 const FILE: &str = "transforms.json";
 
 /// The points file, with nerfstudio's name.
 const POINTS: &str = "sparse_pc.ply";
 
-/// Returns true if the folder contains a file of this format.
-pub(crate) fn detect(folder: &Path) -> bool {
-    folder.join(FILE).is_file()
+/// The file of a capture's folder.
+pub(super) fn file(folder: &Path) -> PathBuf {
+    folder.join(FILE)
 }
 
 /// Reads `transforms.json`, without decoding images.
@@ -36,9 +36,13 @@ pub(crate) fn detect(folder: &Path) -> bool {
 /// If the file cannot be read, lacks a field, or has a field that is wrong or unsupported. If a mask or depth file is
 /// absent or damaged, or the points file is damaged.
 pub fn read(folder: &Path) -> Result<Capture> {
-    let file = folder.join(FILE);
-    let document = json::read(&file)?;
-    let top = Object::top(&file, &document)?;
+    read_file(folder, &file(folder))
+}
+
+/// [`read`] for a file of any name; its paths are relative to `folder`.
+pub(super) fn read_file(folder: &Path, file: &Path) -> Result<Capture> {
+    let document = json::read(file)?;
+    let top = Object::top(file, &document)?;
     let Frames { views, left_out, assumptions, .. } = Frames::read(&[top.clone()], folder, Dialect::Transforms)?;
     let mut views: Vec<View> = views.into_iter().flatten().collect();
     read_splits(&top, &mut views, &left_out)?;
@@ -54,7 +58,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
     let points_file = points_file.filter(|file| file.is_file());
     // The points are in the coordinates of the file: nerfstudio transforms them together with the cameras.
     let points = points_file.as_deref().map_or(Ok(vec![]), ply::read)?;
-    let capture = Capture::new(folder, file.clone(), Format::Transforms, views);
+    let capture = Capture::new(folder, file.to_owned(), Format::Transforms, views);
     Ok(Capture { points, points_file, aabb_scale, applied, assumptions, ..capture })
 }
 
@@ -102,7 +106,7 @@ fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>)
 /// # Errors
 /// If there are no views, a camera has no size or a non-finite number, or a file cannot be written.
 pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
-    let file = folder.join(FILE);
+    let file = file(folder);
     if capture.views.is_empty() {
         return Err(Error::file(&file, "cannot be written: there are no images"));
     }

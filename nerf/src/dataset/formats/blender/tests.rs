@@ -38,7 +38,8 @@ fn fails(change: impl FnOnce(&mut Value), parts: &[&str]) {
 #[test]
 fn images_and_cameras_are_read() {
     let folder = folder(|_| {});
-    assert!(detect(folder.path()) && !detect(tempfile::tempdir().unwrap().path()));
+    assert_eq!(file(folder.path()), Some(folder.path().join(FILE)));
+    assert_eq!(file(tempfile::tempdir().unwrap().path()), None);
     let capture = read(folder.path()).unwrap();
     assert_eq!((capture.views.len(), capture.format), (2, Format::Blender));
     let view = &capture.views[1];
@@ -210,7 +211,7 @@ fn unsupported_views_are_errors() {
         let message = write(&capture, folder.path()).unwrap_err().to_string();
         says(&message, &["cannot be written in Blender's format: images/r_1 "]);
         says(&message, parts);
-        assert!(!detect(folder.path()));
+        assert_eq!(file(folder.path()), None);
     };
     let undistort = "`raygrad prepare --undistort`";
     fails(|v| v.camera.lens = Lens::Fov { omega: 0.9 }, &["has lens distortion", undistort]);

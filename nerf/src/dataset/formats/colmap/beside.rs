@@ -15,23 +15,23 @@ const MASKS: [&str; 2] = ["masks", "mask"];
 /// # Errors
 /// If two files fit the name of an image.
 pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
-    let mut roots = vec![capture.folder.clone()];
-    if model == capture.folder {
-        // The capture's folder may be `sparse` or `sparse/0` itself.
-        roots.extend([model.join(".."), model.join("..").join("..")]);
-    }
+    let root = if model == capture.folder { root(model) } else { capture.folder.clone() };
     let folders = |names: &[&str]| -> Vec<PathBuf> {
-        roots.iter().flat_map(|root| names.iter().map(move |name| root.join(name))).filter(|f| f.is_dir()).collect()
+        names.iter().map(|name| root.join(name)).filter(|folder| folder.is_dir()).collect()
     };
     // All images come from one folder, since others may hold the same names at another size. Names may also be relative
     // to the folder of the capture.
     let mut images = folders(&IMAGES);
-    images.push(capture.folder.clone());
+    if model.components().any(|part| part.as_os_str() == "distorted") {
+        // 3D Gaussian Splatting keeps undistorted images in `images`, and those of this model in `input`.
+        images.reverse();
+    }
+    images.extend([root.clone(), capture.folder.clone()]);
     let has_any = |folder: &&PathBuf| capture.views.iter().any(|view| folder.join(&view.name).is_file());
     let (folder, below) = match images.iter().find(has_any) {
         Some(folder) => (folder.clone(), ""),
         // Names of a model are relative to its folder of images.
-        None => (root(capture, model), "images/"),
+        None => (root.clone(), "images/"),
     };
     let names: Vec<String> = capture.views.iter().map(|view| format!("{below}{}", view.name)).collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
@@ -48,11 +48,10 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The folder of the capture: that of `sparse` for the model `sparse/0`.
-fn root(capture: &Capture, model: &Path) -> PathBuf {
-    if model != capture.folder {
-        return capture.folder.clone();
-    }
+/// The folder of the capture of a model: that of `sparse` for the model `sparse/0`, also in `colmap` or `distorted`.
+pub(in super::super) fn root(model: &Path) -> PathBuf {
     let sparse = model.ancestors().take(2).find(|folder| folder.ends_with("sparse"));
-    sparse.and_then(Path::parent).unwrap_or(model).to_owned()
+    let Some(parent) = sparse.and_then(Path::parent) else { return model.to_owned() };
+    let is_inner = ["colmap", "distorted"].iter().any(|name| parent.ends_with(name));
+    parent.parent().filter(|_| is_inner).unwrap_or(parent).to_owned()
 }

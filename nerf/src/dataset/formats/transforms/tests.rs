@@ -36,12 +36,6 @@ fn fails(change: impl FnOnce(&mut Value), parts: &[&str]) {
 }
 
 #[test]
-fn detect_needs_the_transforms_file() {
-    assert!(detect(folder(|_| {}).path()));
-    assert!(!detect(tempfile::tempdir().unwrap().path()));
-}
-
-#[test]
 fn views_keep_file_order_and_their_field() {
     let folder = folder(|_| {});
     let capture = read(folder.path()).unwrap();

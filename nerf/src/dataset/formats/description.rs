@@ -1,0 +1,158 @@
+//! Which files of a folder describe a capture.
+
+use super::{blender, colmap, llff, transforms};
+use crate::dataset::capture::{Capture, Format};
+use crate::dataset::frames::Split;
+use crate::error::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// Files of other programs that are no capture yet: a file or folder, the program, and the remedy.
+const EXPORTS: [(&str, &str, &str); 6] = [
+    ("keyframes", "a raw export of Polycam", "convert it with nerfstudio's `ns-process-data polycam`"),
+    ("rgbd", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
+    ("EXR_RGBD", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
+    ("intrinsics.txt", "a dataset of NSVF", "write its poses as transforms_train.json"),
+    ("cameras_sphere.npz", "a dataset of DTU", "write its matrices as transforms.json"),
+    ("database.db", "a COLMAP project without a model", "run COLMAP's mapper, or `raygrad prepare` on the images"),
+];
+
+/// The files that describe a capture.
+#[derive(Debug, Clone, PartialEq)]
+struct Description {
+    format: Format,
+    /// The folder of the capture.
+    folder: PathBuf,
+    /// The file with the cameras.
+    file: PathBuf,
+}
+
+impl Description {
+    fn new(format: Format, folder: &Path, file: PathBuf) -> Self {
+        Description { format, folder: folder.to_owned(), file }
+    }
+
+    /// The description that a file is part of.
+    fn of_file(file: &Path) -> Option<Self> {
+        let folder = file.parent()?;
+        let (name, ending) = (file.file_name()?.to_str()?, file.extension()?.to_str()?);
+        let format = match (name, ending) {
+            _ if Split::ALL.iter().any(|split| name == blender::name_of(*split)) => Format::Blender,
+            (_, "json") => Format::Transforms,
+            ("poses_bounds.npy", _) => Format::Llff,
+            _ => return Some(Description::new(Format::Colmap, &colmap::root(folder), colmap::images_beside(file)?)),
+        };
+        Some(Description::new(format, folder, file.to_owned()))
+    }
+
+    /// Reads the capture.
+    fn read(&self) -> Result<Capture> {
+        let Description { format, folder, file } = self;
+        match format {
+            Format::Blender => blender::read(folder),
+            Format::Transforms => transforms::read_file(folder, file),
+            Format::Colmap => colmap::read_model(folder, file),
+            Format::Llff => llff::read(folder),
+        }
+    }
+
+    /// The path below the capture's folder, of a COLMAP model without its file.
+    fn name(&self) -> String {
+        let inside = self.file.strip_prefix(&self.folder).unwrap_or(&self.file);
+        let inside = if self.format == Format::Colmap { inside.parent().unwrap_or(inside) } else { inside };
+        let name = inside.display().to_string();
+        if name.is_empty() { self.format.to_string() } else { name }
+    }
+}
+
+/// The descriptions in a folder: `transforms.json`, Blender, COLMAP's models, and LLFF. Earlier ones hold more, and are
+/// usually derived from later ones.
+fn descriptions(folder: &Path) -> Vec<Description> {
+    let mut out = vec![];
+    let file = transforms::file(folder);
+    if file.is_file() {
+        out.push(Description::new(Format::Transforms, folder, file));
+    }
+    if let Some(file) = blender::file(folder) {
+        out.push(Description::new(Format::Blender, folder, file));
+    }
+    out.extend(colmap::models(folder).into_iter().map(|file| Description::new(Format::Colmap, folder, file)));
+    let file = llff::file(folder);
+    if file.is_file() {
+        out.push(Description::new(Format::Llff, folder, file));
+    }
+    out
+}
+
+/// Reads the capture in a folder, or that of a file that describes one. `asked` limits the formats.
+///
+/// Of several descriptions, the one with most existing images counts; of equally many, the first.
+///
+/// # Errors
+/// If there is no description, a description before the best cannot be read, or as the format's own `read`.
+pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>) -> Result<Capture> {
+    if path.is_file() {
+        let what = "does not describe a capture: name a folder, a .json file, poses_bounds.npy, or images.bin of a COLMAP \
+                    model";
+        let description = Description::of_file(path).ok_or_else(|| Error::file(path, what))?;
+        return description.read();
+    }
+    let mut all = descriptions(path);
+    all.retain(|description| asked.is_none_or(|format| description.format == format));
+    let Some(first) = all.first() else { return Err(unknown(path, asked)) };
+    if all.len() == 1 {
+        return first.read();
+    }
+    let mut captures: Vec<(&Description, Result<Capture>)> = all.iter().map(|one| (one, one.read())).collect();
+    let present = |capture: &Result<Capture>| capture.as_ref().map_or(0, |capture| capture.present().count());
+    // The first of the best.
+    let most = captures.iter().map(|(_, capture)| present(capture)).max().unwrap_or(0);
+    let best = captures.iter().position(|(_, capture)| present(capture) == most).unwrap_or(0);
+    if let Some(damaged) = captures[..=best].iter().position(|(_, capture)| capture.is_err()) {
+        let (description, capture) = captures.swap_remove(damaged);
+        let other = captures.iter().find(|(_, capture)| present(capture) > 0).map(|(other, _)| *other);
+        return capture.map_err(|error| match other {
+            Some(other) => {
+                let what = format!("{error}; to use `{}` instead, name {}", other.name(), other.file.display());
+                Error::file(path.join(description.name()), what)
+            }
+            None => error,
+        });
+    }
+    let count = |(description, capture): &(&Description, Result<Capture>)| match capture {
+        Ok(capture) => format!("`{}` {} of {}", description.name(), capture.present().count(), capture.views.len()),
+        Err(_) => format!("`{}` is damaged", description.name()),
+    };
+    let others: Vec<_> = captures.iter().enumerate().filter(|(i, _)| *i != best).collect();
+    // The usual case: one description was made from the other.
+    let is_usual = best == 0 && others.iter().all(|(_, (_, capture))| present(capture) == most);
+    let used = count(&captures[best]);
+    let others: Vec<String> = others.into_iter().map(|(_, other)| count(other)).collect();
+    let mut capture = captures.swap_remove(best).1?;
+    if !is_usual {
+        let what = format!("images found: {used}, {}; used the first", others.join(", "));
+        capture.assumptions.insert(0, what);
+    }
+    Ok(capture)
+}
+
+/// The error of a folder without a description.
+fn unknown(folder: &Path, asked: Option<Format>) -> Error {
+    if let Some(format) = asked {
+        let found: Vec<String> = descriptions(folder).iter().map(|one| format!("`{}`", one.name())).collect();
+        let found = if found.is_empty() { "no capture".to_owned() } else { found.join(", ") };
+        return Error::file(folder, format!("holds no capture in the format {format}, but {found}"));
+    }
+    if let Some(parent) = folder.parent().filter(|parent| !descriptions(parent).is_empty()) {
+        return Error::file(folder, format!("is not a dataset, but `{}` is: use that folder", parent.display()));
+    }
+    if let Some((_, what, remedy)) = EXPORTS.iter().find(|(name, ..)| folder.join(name).exists()) {
+        return Error::file(folder, format!("is {what}, which raygrad does not read: {remedy}"));
+    }
+    let what = "is not a dataset: expected transforms.json (instant-ngp, nerfstudio), transforms_train.json (Blender), \
+        sparse/0/cameras.bin or .txt (COLMAP) or poses_bounds.npy (LLFF); `raygrad prepare` makes one from a video or \
+        images";
+    Error::file(folder, what)
+}
+
+#[cfg(test)]
+mod tests;

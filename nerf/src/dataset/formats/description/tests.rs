@@ -1,0 +1,144 @@
+use super::super::kit;
+use super::*;
+use crate::dataset::capture::View;
+use crate::dataset::formats::colmap::Encoding;
+
+/// Writes a capture of `total` images of which `present` exist, in a format; COLMAP's in the model `number`.
+fn write(folder: &Path, format: Format, [present, total]: [usize; 2], number: usize) {
+    let capture = kit::picture_with_camera(folder);
+    let view = |i: usize| {
+        let name = format!("{i}.png");
+        let image = folder.join("images").join(&name);
+        if i < present {
+            kit::picture(&image, 8, 6);
+        }
+        View { name, image: Some(image), ..capture.views[0].clone() }
+    };
+    let prefix = |view: View| View { name: format!("images/{}", view.name), ..view };
+    let views: Vec<View> = (0..total).map(view).collect();
+    let capture = match format {
+        Format::Colmap | Format::Llff => Capture { views, ..capture },
+        _ => Capture { views: views.into_iter().map(prefix).collect(), ..capture },
+    };
+    match format {
+        Format::Transforms => transforms::write(&capture, folder).unwrap(),
+        Format::Blender => blender::write(&capture, folder).unwrap(),
+        Format::Llff => llff::write(&capture, folder).unwrap(),
+        Format::Colmap => {
+            let other = tempfile::tempdir().unwrap();
+            colmap::write(&capture, other.path(), Encoding::Binary).unwrap();
+            std::fs::create_dir_all(folder.join("sparse")).unwrap();
+            std::fs::rename(other.path().join("sparse/0"), folder.join(format!("sparse/{number}"))).unwrap();
+        }
+    }
+}
+
+#[test]
+fn earlier_formats_have_priority() {
+    let folder = tempfile::tempdir().unwrap();
+    let message = read(folder.path(), None).unwrap_err().to_string();
+    for expected in ["is not a dataset", "transforms.json", "transforms_train.json", "sparse/0", "poses_bounds.npy"] {
+        assert!(message.contains(expected), "{message}");
+    }
+    // Written from the last format to the first: each has priority over the existing ones.
+    for format in [Format::Llff, Format::Colmap, Format::Blender, Format::Transforms] {
+        write(folder.path(), format, [1, 1], 0);
+        let capture = read(folder.path(), None).unwrap();
+        assert_eq!((capture.format, capture.assumptions), (format, vec![]));
+    }
+    for format in [Format::Llff, Format::Colmap, Format::Blender, Format::Transforms] {
+        assert_eq!(read(folder.path(), Some(format)).unwrap().format, format);
+    }
+}
+
+#[test]
+fn most_complete_description_counts() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    write(path, Format::Colmap, [2, 2], 0);
+    write(path, Format::Colmap, [5, 7], 1);
+    let capture = read(path, None).unwrap();
+    assert_eq!(capture.file, path.join("sparse/1/images.bin"));
+    assert_eq!(capture.assumptions, ["images found: `sparse/1` 5 of 7, `sparse/0` 2 of 2; used the first"]);
+    // A file whose images are all absent.
+    write(path, Format::Transforms, [0, 3], 0);
+    let file = path.join("transforms.json");
+    let text = std::fs::read_to_string(&file).unwrap().replace("images/", "../images_of_old/x");
+    std::fs::write(&file, text).unwrap();
+    let capture = read(path, None).unwrap();
+    assert_eq!(capture.format, Format::Colmap);
+    let expected = ["images found: `sparse/1` 5 of 7, `transforms.json` 0 of 3, `sparse/0` 2 of 2; used the first"];
+    assert_eq!(capture.assumptions, expected);
+    // LLFF with all images of the folder.
+    std::fs::remove_dir_all(path.join("sparse/1")).unwrap();
+    write(path, Format::Llff, [5, 5], 0);
+    assert_eq!(read(path, None).unwrap().format, Format::Llff);
+    assert!(
+        read(path, Some(Format::Blender))
+            .unwrap_err()
+            .to_string()
+            .ends_with("holds no capture in the format Blender, but `transforms.json`, `sparse/0`, `poses_bounds.npy`")
+    );
+}
+
+#[test]
+fn files_name_their_description() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    write(path, Format::Colmap, [4, 4], 0);
+    write(path, Format::Colmap, [2, 2], 3);
+    write(path, Format::Transforms, [3, 3], 0);
+    std::fs::copy(path.join("transforms.json"), path.join("some.json")).unwrap();
+    let count = |file: &str| {
+        let capture = read(&path.join(file), None).unwrap();
+        assert_eq!((capture.folder.as_path(), capture.assumptions.len()), (path, 0), "{file}");
+        capture.present().count()
+    };
+    for (file, expected) in [
+        ("transforms.json", 3),
+        ("some.json", 3),
+        ("sparse/0/images.bin", 4),
+        ("sparse/3/images.bin", 2),
+        ("sparse/3/cameras.bin", 2),
+        ("sparse/3/points3D.bin", 2),
+    ] {
+        assert_eq!(count(file), expected, "{file}");
+    }
+    assert_eq!(read(&path.join("sparse/3"), None).unwrap().present().count(), 2, "a model's folder");
+    let message = read(&path.join("images/0.png"), None).unwrap_err().to_string();
+    assert!(message.contains("images/0.png: does not describe a capture: name a folder"), "{message}");
+    write(path, Format::Blender, [1, 1], 0);
+    write(path, Format::Llff, [4, 4], 0);
+    assert_eq!(read(&path.join("transforms_train.json"), None).unwrap().format, Format::Blender);
+    assert_eq!(read(&path.join("poses_bounds.npy"), None).unwrap().format, Format::Llff);
+}
+
+#[test]
+fn damaged_descriptions_before_the_best_are_errors() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    write(path, Format::Colmap, [3, 3], 0);
+    std::fs::write(path.join("transforms.json"), "{").unwrap();
+    let message = read(path, None).unwrap_err().to_string();
+    assert!(message.contains("transforms.json") && message.contains("is not valid JSON"), "{message}");
+    assert!(
+        message.contains("; to use `sparse/0` instead, name ") && message.ends_with("sparse/0/images.bin"),
+        "{message}"
+    );
+    // Damaged descriptions after the best are named.
+    std::fs::remove_file(path.join("transforms.json")).unwrap();
+    write(path, Format::Colmap, [1, 1], 1);
+    std::fs::write(path.join("sparse/1/images.bin"), "?").unwrap();
+    let expected = ["images found: `sparse/0` 3 of 3, `sparse/1` is damaged; used the first"];
+    assert_eq!(read(path, None).unwrap().assumptions, expected);
+}
+
+#[test]
+fn exports_of_other_programs_are_named() {
+    for (name, what, remedy) in EXPORTS {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join(name), b"").unwrap();
+        let message = read(folder.path(), None).unwrap_err().to_string();
+        assert!(message.contains(what) && message.contains(remedy), "{message}");
+    }
+}
