@@ -14,6 +14,7 @@ use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use crate::memory::{available_memory, gigabytes};
+use crate::numbers::median;
 use glam::DAffine3;
 use raygrad_tensor::parallel::{self, locked};
 use std::collections::HashMap;
@@ -29,6 +30,10 @@ const LOOKED_AT: usize = 3;
 const CLEAR: f64 = 0.05;
 /// The white share of the border from which an image shows an object in front of white.
 const WHITE_BORDER: f64 = 0.98;
+/// The longest side of an image, and of a panorama, after automatic downscaling; and the number of images that decide.
+const MOST_AUTOMATIC: f64 = 1600.0;
+const MOST_OF_PANORAMA: f64 = 6400.0;
+const MEASURED: usize = 25;
 /// The largest downscale factor that is suggested.
 const MOST_DOWNSCALE: u64 = 1 << 14;
 /// The least mask value of a used pixel.
@@ -96,12 +101,12 @@ impl Capture {
             return Err(Error::file(path, "there is no such folder"));
         }
         let mut capture = formats::read(path, format)?;
-        capture.hold_out();
+        capture.split_by_default();
         capture.check_splits()?;
         Ok(capture)
     }
 
-    fn hold_out(&mut self) {
+    fn split_by_default(&mut self) {
         let held_out = |view: &View| matches!(view.split, Some(Split::Val | Split::Test));
         if self.views.iter().all(|view| view.split.is_none()) {
             self.views.sort_by(|a, b| a.name.cmp(&b.name));
@@ -124,7 +129,7 @@ impl Capture {
     }
 
     /// Checks that no held-out image is also trained on.
-    fn check_splits(&self) -> Result<()> {
+    pub(super) fn check_splits(&self) -> Result<()> {
         let train = self.present().filter(|view| view.split == Some(Split::Train));
         let trained: HashMap<&PathBuf, &View> = train.filter_map(|view| Some((view.image.as_ref()?, view))).collect();
         for view in self.present().filter(|view| view.split != Some(Split::Train)) {
@@ -193,6 +198,18 @@ impl Capture {
             _ => None,
         };
         SceneAnalysis::new(self, empty, asked)
+    }
+
+    /// Returns the downscale factor that brings the longest side of most images to 1600 pixels or less, as nerfstudio's
+    /// does, or that of panoramas to 6400. It is 1 for images whose headers cannot be read.
+    pub fn automatic_downscale(&self) -> usize {
+        let side = |view: &View| {
+            let [width, height] = Photo::size_of_file(view.image.as_ref()?).ok()?[0];
+            let most = if view.camera.lens == Lens::Equirectangular { MOST_OF_PANORAMA } else { MOST_AUTOMATIC };
+            Some(width.max(height) as f64 / most)
+        };
+        let factors = evenly_spaced(self.present().collect(), MEASURED).into_iter().filter_map(side);
+        (median(factors).ceil() as usize).max(1)
     }
 
     /// Reads one image at full size, in the orientation of its camera, without its mask.

@@ -30,7 +30,7 @@ fn numbers(views: &[&View]) -> Vec<String> {
 fn every_eighth_image_is_held_out() {
     let folder = tempfile::tempdir().unwrap();
     let mut whole = capture(folder.path(), 17);
-    whole.hold_out();
+    whole.split_by_default();
     assert_eq!(numbers(&whole.split(Split::Test).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
     assert_eq!(numbers(&whole.split(Split::Val).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
     let train = numbers(&whole.split(Split::Train).unwrap());
@@ -38,7 +38,7 @@ fn every_eighth_image_is_held_out() {
     // An absent image does not move others to another split.
     let mut lost = capture(folder.path(), 17);
     lost.views.iter_mut().find(|view| view.field == "frames[5]").unwrap().image = None;
-    lost.hold_out();
+    lost.split_by_default();
     assert_eq!(numbers(&lost.split(Split::Test).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
     // The order of the images does not matter.
     assert!(!capture(folder.path(), 17).holds_out_every_eighth() && whole.holds_out_every_eighth());
@@ -50,16 +50,16 @@ fn every_eighth_image_is_held_out() {
     one.views[0].split = Some(Split::Test);
     assert!(!one.holds_out_every_eighth(), "there is nothing to hold it out of");
     let mut few = capture(folder.path(), 2);
-    few.hold_out();
+    few.split_by_default();
     assert!(few.split(Split::Test).is_err() && few.split(Split::Train).unwrap().len() == 2);
     // With a training list alone, all others become test images; with more lists, nothing is added.
     let mut listed = capture(folder.path(), 4);
     listed.views[1].split = Some(Split::Train);
-    listed.hold_out();
+    listed.split_by_default();
     assert_eq!(listed.split(Split::Test).unwrap().len(), 3);
     let mut both = capture(folder.path(), 4);
     (both.views[1].split, both.views[2].split) = (Some(Split::Train), Some(Split::Val));
-    both.hold_out();
+    both.split_by_default();
     assert_eq!((both.split(Split::Test).unwrap().len(), both.split(Split::Train).unwrap().len()), (1, 1));
 }
 
@@ -67,7 +67,7 @@ fn every_eighth_image_is_held_out() {
 fn image_in_two_splits_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 17);
-    capture.hold_out();
+    capture.split_by_default();
     capture.check_splits().unwrap();
     let analysis = capture.analyze_scene(None).unwrap();
     let names = |split: Split| {
@@ -86,7 +86,7 @@ fn image_in_two_splits_is_an_error() {
 fn cameras_scale_with_their_images() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
-    capture.hold_out();
+    capture.split_by_default();
     let analysis = capture.analyze_scene(None).unwrap();
     let seen = Mutex::new(vec![]);
     let progress = |done: usize, total: usize| seen.lock().unwrap().push((done, total));
@@ -117,7 +117,7 @@ fn cameras_scale_with_their_images() {
 fn image_of_other_shape_than_camera_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
-    capture.hold_out();
+    capture.split_by_default();
     let analysis = capture.analyze_scene(None).unwrap();
     for name in ["03", "05"] {
         let image = Image::new(13, 8, 3);
@@ -146,7 +146,7 @@ fn image_of_other_shape_than_camera_is_an_error() {
 fn downscaled_image_folders_are_used() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
-    capture.hold_out();
+    capture.split_by_default();
     std::fs::create_dir(folder.path().join("images_4")).unwrap();
     let small = Image { width: 3, height: 2, channels: 3, data: vec![1.0; 18] };
     std::fs::write(folder.path().join("images_4/01.png"), small.to_png()).unwrap();
@@ -164,7 +164,7 @@ fn downscaled_image_folders_are_used() {
 fn masks_drop_black_and_unlit_pixels() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
-    capture.hold_out();
+    capture.split_by_default();
     let path = folder.path().join("mask.png");
     let mut mask = Image { width: 24, height: 16, channels: 1, data: vec![1.0; 24 * 16] };
     mask.pixel_mut(9, 2)[0] = 0.0;
@@ -206,7 +206,7 @@ fn masks_drop_black_and_unlit_pixels() {
 fn object_in_front_of_white_is_bounded() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
-    capture.hold_out();
+    capture.split_by_default();
     let paint = |border: f32, spoilt: usize| {
         for (i, view) in capture.views.iter().enumerate() {
             let mut image = Image::new(12, 8, 3);
@@ -240,7 +240,7 @@ fn object_in_front_of_white_is_bounded() {
 fn distances_are_read_if_requested() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
-    capture.hold_out();
+    capture.split_by_default();
     let path = folder.path().join("depth.png");
     image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(12, 8, image::Luma([500])).save(&path).unwrap();
     let measured = capture.views.iter_mut().find(|view| view.field == "frames[3]").unwrap();
@@ -268,7 +268,7 @@ fn distances_are_read_if_requested() {
 fn unlit_pixels_are_dropped_with_or_without_mask() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
-    capture.hold_out();
+    capture.split_by_default();
     // Half a turn is 3.14 of the 12 x 8 pixels from the centre; the camera has the size 24 x 16.
     let lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
     for view in &mut capture.views {
@@ -296,7 +296,7 @@ fn unlit_pixels_are_dropped_with_or_without_mask() {
 fn images_beyond_the_memory_are_refused_before_decoding() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
-    capture.hold_out();
+    capture.split_by_default();
     let analysis = capture.analyze_scene(Some(SceneType::Bounded)).unwrap();
     // A large image in a small file. Most of its pixels are not there, so decoding it would fail.
     let huge = folder.path().join("images/huge.png");
@@ -332,7 +332,7 @@ fn images_beyond_the_memory_are_refused_before_decoding() {
 fn little_memory_loads_the_same_images_in_turns() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
-    capture.hold_out();
+    capture.split_by_default();
     let analysis = capture.analyze_scene(Some(SceneType::Bounded)).unwrap();
     let load = |memory: u64| {
         let options = LoadOptions { memory: Some(memory), ..LoadOptions::default() };
@@ -369,4 +369,26 @@ fn plan_counts_the_mask_and_the_depths() {
     assert_eq!(plan(&view, false), (masked, 4 * pixels));
     assert_eq!(plan(&view, true), (masked + 3 * 1006, 8 * pixels));
     assert_eq!(view.decoding_memory(), masked + 3 * 1006);
+}
+
+#[test]
+fn automatic_downscale_limits_the_longest_side() {
+    let folder = tempfile::tempdir().unwrap();
+    let factor = |sizes: &[[usize; 2]], lens: Lens| {
+        let mut capture = capture(folder.path(), sizes.len() + 3);
+        for (view, size) in capture.views.iter_mut().filter(|view| view.field != "frames[2]").zip(sizes) {
+            Image::new(size[0], size[1], 1).save_png(view.image.as_ref().unwrap()).unwrap();
+            view.camera.lens = lens;
+        }
+        capture.views.truncate(sizes.len());
+        capture.automatic_downscale()
+    };
+    for (size, expected) in [([1600, 2], 1), ([2, 1601], 2), ([4032, 3], 3), ([3, 4801], 4), ([8, 8], 1)] {
+        assert_eq!(factor(&[size], Lens::Pinhole), expected, "{size:?}");
+    }
+    assert_eq!(factor(&[[6400, 2]], Lens::Equirectangular), 1);
+    assert_eq!(factor(&[[8192, 2]], Lens::Equirectangular), 2);
+    // A single large image does not count.
+    assert_eq!(factor(&[[5000, 1], [1600, 1], [1600, 1]], Lens::Pinhole), 1);
+    assert_eq!(Capture::new(folder.path(), "t.json".into(), Format::Transforms, vec![]).automatic_downscale(), 1);
 }

@@ -1,0 +1,200 @@
+//! The choice of images that are held out for evaluation.
+
+use super::capture::{Capture, View};
+use super::frames::Split;
+use crate::error::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+
+/// The images that are held out as [test](Split::Test) images; all others are trained on.
+///
+/// As text it is `none`, `every:8`, or names separated by commas.
+///
+/// # Examples
+///
+/// ```
+/// use raygrad_nerf::dataset::HoldOut;
+///
+/// assert_eq!("every:8".parse::<HoldOut>()?, HoldOut::Every(8));
+/// assert_eq!("a.jpg,b.jpg".parse::<HoldOut>()?, HoldOut::Images(vec!["a.jpg".into(), "b.jpg".into()]));
+/// # Ok::<(), raygrad_nerf::Error>(())
+/// ```
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum HoldOut {
+    /// No image.
+    None,
+    /// Every this many images by name, from the first; at least 2.
+    Every(usize),
+    /// The images with these names, or with these ends of their paths, also without the extension.
+    Images(Vec<String>),
+}
+
+impl fmt::Display for HoldOut {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            HoldOut::None => f.write_str("none"),
+            HoldOut::Every(count) => write!(f, "every:{count}"),
+            HoldOut::Images(names) => f.write_str(&names.join(",")),
+        }
+    }
+}
+
+impl From<HoldOut> for String {
+    fn from(chosen: HoldOut) -> Self {
+        chosen.to_string()
+    }
+}
+
+impl FromStr for HoldOut {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        if text == "none" {
+            return Ok(HoldOut::None);
+        }
+        let wrong = |remedy: &str| Error::setting("test", format!("is `{text}`; {remedy}"));
+        if let Some(count) = text.strip_prefix("every:") {
+            let count = count.parse().ok().filter(|count| *count >= 2);
+            return count.map(HoldOut::Every).ok_or_else(|| wrong("use every:N with N of at least 2"));
+        }
+        let names: Vec<String> = text.split(',').map(|name| name.trim().to_owned()).collect();
+        match names.iter().any(String::is_empty) {
+            true => Err(wrong("use none, every:N or names of images separated by commas")),
+            false => Ok(HoldOut::Images(names)),
+        }
+    }
+}
+
+impl TryFrom<String> for HoldOut {
+    type Error = Error;
+
+    fn try_from(text: String) -> Result<Self> {
+        text.parse()
+    }
+}
+
+impl Capture {
+    /// Replaces the splits of the files, or those that [`read`](Self::read) chose, by these held-out images.
+    ///
+    /// # Errors
+    /// If a name fits no image or several, or the file of a held-out image is also trained on.
+    pub fn hold_out(&mut self, chosen: &HoldOut) -> Result<()> {
+        let held_out: Vec<usize> = match chosen {
+            HoldOut::None => vec![],
+            HoldOut::Every(count) => {
+                let mut by_name: Vec<usize> = (0..self.views.len()).collect();
+                by_name.sort_by_key(|&i| &self.views[i].name);
+                by_name.into_iter().step_by(*count).collect()
+            }
+            HoldOut::Images(names) => names.iter().map(|name| self.named_view(name)).collect::<Result<_>>()?,
+        };
+        self.views.iter_mut().for_each(|view| view.split = Some(Split::Train));
+        held_out.into_iter().for_each(|i| self.views[i].split = Some(Split::Test));
+        self.check_splits()
+    }
+
+    /// The index of the view with a name: the whole name, or else an end of it, or else one without the extension.
+    fn named_view(&self, name: &str) -> Result<usize> {
+        let is_end = |path: &str| path.strip_suffix(name).is_some_and(|rest| rest.is_empty() || rest.ends_with('/'));
+        let is_stem = |path: &str| path.rsplit_once('.').is_some_and(|(stem, _)| is_end(stem));
+        let rules: [&dyn Fn(&View) -> bool; 3] =
+            [&|view| view.name == name, &|view| is_end(&view.name), &|view| is_stem(&view.name)];
+        let fitting = |rule: &dyn Fn(&View) -> bool| -> Vec<usize> {
+            (0..self.views.len()).filter(|&i| rule(&self.views[i])).collect()
+        };
+        match rules.into_iter().map(fitting).find(|views| !views.is_empty()).unwrap_or_default()[..] {
+            [one] => Ok(one),
+            [one, two, ..] => {
+                let [one, two] = [one, two].map(|i| &self.views[i].name);
+                Err(Error::setting(
+                    "test",
+                    format!("names `{name}`, which fits `{one}` and `{two}`: write more of the path"),
+                ))
+            }
+            [] => {
+                let first = self.views.first().map_or("", |view| &view.name);
+                let what = format!("names `{name}`, which is no image of the capture; names are as `{first}`");
+                Err(Error::setting("test", what))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::pinhole::Camera;
+    use crate::dataset::capture::Format;
+    use glam::DAffine3;
+    use std::path::Path;
+
+    fn capture(names: &[&str]) -> Capture {
+        let camera = Camera::from_angle(8, 6, 0.9, DAffine3::IDENTITY);
+        let view = |name: &&str| View { image: Some(name.into()), ..View::new(*name, *name, camera.clone()) };
+        let views = names.iter().map(view).collect();
+        Capture::new(Path::new("scene"), "transforms.json".into(), Format::Transforms, views)
+    }
+
+    /// The names of held-out images.
+    fn held_out(names: &[&str], chosen: &str) -> Result<Vec<String>> {
+        let mut capture = capture(names);
+        capture.views[0].split = Some(Split::Val);
+        capture.hold_out(&chosen.parse()?)?;
+        assert!(capture.views.iter().all(|view| matches!(view.split, Some(Split::Train | Split::Test))));
+        Ok(capture.views.into_iter().filter(|view| view.split == Some(Split::Test)).map(|view| view.name).collect())
+    }
+
+    #[test]
+    fn chosen_images_are_held_out() {
+        let names = ["images/c.jpg", "images/a.jpg", "images/b.jpg", "images/d.png", "more/d.jpg"];
+        for (chosen, expected) in [
+            ("none", vec![]),
+            ("every:2", vec!["images/a.jpg", "images/c.jpg", "more/d.jpg"]),
+            ("every:9", vec!["images/a.jpg"]),
+            ("images/b.jpg", vec!["images/b.jpg"]),
+            ("b.jpg, c", vec!["images/c.jpg", "images/b.jpg"]),
+            ("d.png", vec!["images/d.png"]),
+            ("more/d", vec!["more/d.jpg"]),
+        ] {
+            let mut found = held_out(&names, chosen).unwrap();
+            let mut expected: Vec<String> = expected.into_iter().map(str::to_owned).collect();
+            (found.sort(), expected.sort());
+            assert_eq!(found, expected, "{chosen}");
+        }
+    }
+
+    #[test]
+    fn unclear_choices_are_refused() {
+        let names = ["images/a.jpg", "images/d.png", "more/d.jpg"];
+        for (chosen, expected) in [
+            ("d", "`test`: names `d`, which fits `images/d.png` and `more/d.jpg`: write more of the path"),
+            ("e.jpg", "`test`: names `e.jpg`, which is no image of the capture; names are as `images/a.jpg`"),
+            // Ends of paths are whole parts.
+            (".jpg", "names `.jpg`, which is no image"),
+            ("every:1", "`test`: is `every:1`; use every:N with N of at least 2"),
+            ("every:x", "use every:N"),
+            ("a.jpg,,", "use none, every:N or names of images separated by commas"),
+            ("", "use none, every:N or names"),
+        ] {
+            let message = held_out(&names, chosen).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
+        // One image under two names.
+        let mut twice = capture(&["a", "b"]);
+        twice.views[1].image = twice.views[0].image.clone();
+        let message = twice.hold_out(&HoldOut::Images(vec!["b".into()])).unwrap_err().to_string();
+        assert!(message.contains("`b` is held out, but its image is trained on as a"), "{message}");
+    }
+
+    #[test]
+    fn choices_round_trip_as_text() {
+        for text in ["none", "every:8", "a.jpg,b/c.jpg"] {
+            let chosen: HoldOut = text.parse().unwrap();
+            assert_eq!(chosen.to_string(), text);
+            assert_eq!(serde_json::to_string(&chosen).unwrap(), format!("\"{text}\""));
+            assert_eq!(serde_json::from_str::<HoldOut>(&format!("\"{text}\"")).unwrap(), chosen);
+        }
+    }
+}
