@@ -17,6 +17,7 @@ mod models;
 pub(super) mod npy;
 mod paths;
 mod ply;
+mod points;
 pub mod rigid;
 pub mod transforms;
 

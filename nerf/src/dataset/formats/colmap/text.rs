@@ -1,6 +1,7 @@
 //! COLMAP's `.txt` files: an entry a line, and comments that start with `#`.
 
 use super::super::limits::start;
+use super::super::points::{Points, reason};
 use super::entries::{CameraEntry, ImageEntry, Place};
 use super::models;
 use super::table::Table;
@@ -117,19 +118,34 @@ fn observations(line: &Words<'_>) -> Result<()> {
     Ok(())
 }
 
-pub(super) fn points(file: &Path, bytes: &[u8]) -> Result<Vec<Point>> {
-    let point = |mut line: Words<'_>| {
-        line.integer::<u64>("POINT3D_ID")?;
-        let position = DVec3::from_array([line.number("X")?, line.number("Y")?, line.number("Z")?]);
-        let color = [line.integer("R")?, line.integer("G")?, line.integer("B")?];
-        let error = line.number("ERROR")?;
-        let track = line.rest.split_whitespace().count();
-        if !track.is_multiple_of(2) {
-            return Err(line.error("TRACK", "must be pairs IMAGE_ID POINT2D_IDX"));
-        }
-        Ok(Point { position, color, error, views: u32::try_from(track / 2).unwrap_or(u32::MAX) })
+/// Reads the points of all valid lines.
+pub(super) fn points(file: &Path, bytes: &[u8]) -> Points {
+    let lines = match lines(file, bytes) {
+        Ok(lines) => lines,
+        Err(error) => return Points::unreadable(reason(error)),
     };
-    lines(file, bytes)?.filter(speaks).map(point).collect()
+    let mut points = Points::default();
+    for line in lines.filter(speaks) {
+        let place = line.place;
+        points.total += 1;
+        match point(line) {
+            Ok(point) => _ = points.push(point, || place.name()),
+            Err(error) => points.leave_out(|| reason(error)),
+        }
+    }
+    points
+}
+
+fn point(mut line: Words<'_>) -> Result<Point> {
+    line.integer::<u64>("POINT3D_ID")?;
+    let position = DVec3::from_array(line.numbers("XYZ")?);
+    let color = [line.integer("R")?, line.integer("G")?, line.integer("B")?];
+    let error = line.number("ERROR")?;
+    let track = line.rest.split_whitespace().count();
+    if !track.is_multiple_of(2) {
+        return Err(line.error("TRACK", "must be pairs IMAGE_ID POINT2D_IDX"));
+    }
+    Ok(Point { position, color, error, views: u32::try_from(track / 2).unwrap_or(u32::MAX) })
 }
 
 pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {

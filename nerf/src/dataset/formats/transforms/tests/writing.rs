@@ -43,6 +43,7 @@ fn capture(folder: &Path) -> Capture {
         views: (0..3).map(view).collect(),
         points: (0..5).map(point).collect(),
         points_file: Some(folder.join(POINTS)),
+        assumptions: vec![],
         aabb_scale: Some(16.0),
         applied: DAffine3 {
             matrix3: DMat3::from_rotation_z(0.4) * (1.0 / 3.0),
