@@ -12,6 +12,7 @@ mod layers;
 mod lens;
 mod limits;
 pub mod llff;
+mod masks;
 mod matrix;
 mod models;
 pub(super) mod npy;

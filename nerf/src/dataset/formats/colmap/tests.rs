@@ -164,9 +164,36 @@ fn images_and_masks_are_found() {
     assert_eq!(found(root), [[Some(a), Some(mask_a)], [Some(b), Some(mask_b)]]);
     let mask_a = touch("masks/a.png.png");
     assert_eq!(found(root)[0][1], Some(mask_a), "COLMAP's own name comes first");
+    assert_eq!(read(root).unwrap().assumptions, [""; 0]);
     // Reading the folder of the model finds the same files.
     let from_model = found(&root.join("sparse/0"));
     assert!(from_model.iter().flatten().all(Option::is_some), "{from_model:?}");
+}
+
+#[test]
+fn masks_are_found_in_any_case() {
+    for (mask, is_found) in [
+        ("a.png.png", true),
+        ("A.PNG.png", true),
+        ("a.PNG", true),
+        ("A.png", true),
+        ("a.mask.png", false),
+        ("b.png", false),
+        ("a.png/x", false),
+    ] {
+        let folder = folder(Encoding::Binary, "sparse/0", &binary());
+        for path in ["images/a.png", "images/b/second.png", &format!("masks/{mask}")] {
+            let path = folder.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "").unwrap();
+        }
+        let capture = read(folder.path()).unwrap();
+        let expected = is_found.then(|| folder.path().join("masks").join(mask));
+        assert_eq!((&capture.views[0].mask, &capture.views[1].mask), (&expected, &None), "{mask}");
+        let count = usize::from(is_found);
+        let said = format!("{count} of 2 images have a mask in `masks`; the others use all pixels");
+        assert_eq!(capture.assumptions, [said]);
+    }
 }
 
 /// Reads the fixture with one file replaced and expects an error about that file.
