@@ -52,12 +52,18 @@ impl fmt::Display for Scene {
 }
 
 impl Scene {
-    /// Reads the scene's files and analyses the scene. `asked` overrides the scene type.
-    pub fn open(&self, asked: Option<SceneType>) -> Result<Opened> {
-        let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, asked)) };
+    /// Reads the scene's files and analyses the scene. `asked` overrides the scene type; with `mask_as_alpha` masks cut
+    /// out an object.
+    pub fn open(&self, asked: Option<SceneType>, mask_as_alpha: bool) -> Result<Opened> {
+        let Scene::Folder(folder) = self else {
+            if mask_as_alpha {
+                return Err(Error::setting("mask-as-alpha", "built-in scenes have no masks: leave the flag out"));
+            }
+            return Ok(Opened::new(self, None, asked));
+        };
         let capture = Capture::read(folder)?;
-        let analysis = capture.analyze_scene(asked)?;
-        Ok(Opened::new(self, Some((capture, analysis)), asked))
+        let analysis = if mask_as_alpha { capture.analyze_cutout(asked) } else { capture.analyze_scene(asked) }?;
+        Ok(Opened { mask_as_alpha, ..Opened::new(self, Some((capture, analysis)), asked) })
     }
 
     /// Like [`open`](Self::open), with the scene transform of a model. `unbounded` is true for an unbounded scene.
@@ -87,6 +93,8 @@ impl Scene {
 pub struct Opened {
     /// True to load measured depths with the images.
     pub depth: bool,
+    /// True if masks become alpha.
+    pub mask_as_alpha: bool,
     scene: Scene,
     /// Capture and analysis of a folder.
     pub capture: Option<(Capture, SceneAnalysis)>,
@@ -96,7 +104,7 @@ pub struct Opened {
 
 impl Opened {
     fn new(scene: &Scene, capture: Option<(Capture, SceneAnalysis)>, asked: Option<SceneType>) -> Self {
-        Opened { depth: false, scene: scene.clone(), capture, asked }
+        Opened { depth: false, mask_as_alpha: false, scene: scene.clone(), capture, asked }
     }
 
     /// Loads at most `views` evenly spaced images of a split at `1 / downscale` of their size. Warns of absent images.
@@ -128,10 +136,18 @@ impl Opened {
             Some((capture, analysis)) => {
                 let (progress, words) = (Progress::new(), format!("{split} images read"));
                 let show = |done: usize, total: usize| progress.count(done, total, &words);
+                let mask_as_alpha = self.mask_as_alpha;
                 capture.load(
                     split,
                     analysis,
-                    &LoadOptions { downscale, views, distances: self.depth, memory: None, progress: &show },
+                    &LoadOptions {
+                        downscale,
+                        views,
+                        distances: self.depth,
+                        mask_as_alpha,
+                        memory: None,
+                        progress: &show,
+                    },
                 )?
             }
         };
