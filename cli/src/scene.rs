@@ -180,3 +180,37 @@ fn divides(downscale: usize, [width, height]: [usize; 2]) -> Result<()> {
     }
     Err(Error::setting("downscale", format!("{downscale} does not divide the image size {width}x{height}")))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::Image;
+    use serde_json::json;
+
+    #[test]
+    fn masks_as_alpha_are_loaded_as_an_object() {
+        let folder = tempfile::tempdir().unwrap();
+        let frame = |i: usize| {
+            let mut mask = Image { width: 8, height: 6, channels: 1, data: vec![1.0; 48] };
+            Image::new(8, 6, 3).save_png(folder.path().join(format!("{i}.png"))).unwrap();
+            mask.pixel_mut(3, 2)[0] = 0.0;
+            mask.save_png(folder.path().join(format!("mask{i}.png"))).unwrap();
+            let matrix = json!([[1, 0, 0, i], [0, 1, 0, i * i % 3], [0, 0, 1, 4], [0, 0, 0, 1]]);
+            json!({ "file_path": format!("{i}.png"), "mask_path": format!("mask{i}.png"), "transform_matrix": matrix })
+        };
+        let transforms = json!({ "fl_x": 9.0, "frames": (0..3).map(frame).collect::<Vec<_>>() });
+        std::fs::write(folder.path().join("transforms.json"), transforms.to_string()).unwrap();
+        let scene = Scene::Folder(folder.path().to_owned());
+        for mask_as_alpha in [false, true] {
+            let opened = scene.open(None, mask_as_alpha).unwrap();
+            let data = opened.load(Split::Train, 1, usize::MAX).unwrap();
+            assert_eq!(data.scene_type == SceneType::Bounded, mask_as_alpha);
+            let frame = &data.frames[0];
+            assert_eq!((frame.image.has_alpha(), frame.mask.is_some()), (mask_as_alpha, !mask_as_alpha));
+            let [hidden, used] = [[3, 2], [4, 2]].map(|[x, y]| frame.image.pixel(x, y)[3]);
+            assert_eq!((hidden, used), (f32::from(u8::from(!mask_as_alpha)), 1.0));
+        }
+        let message = Scene::Embedded.open(None, true).err().unwrap().to_string();
+        assert_eq!(message, "`mask-as-alpha`: built-in scenes have no masks: leave the flag out");
+    }
+}
