@@ -11,7 +11,7 @@ use super::parse::read_text;
 use super::run::Run;
 
 /// Conditions that must be equal for comparable results.
-const SAME: [&str; 13] = [
+const SAME: [&str; 14] = [
     "scene",
     "split",
     "hold_out",
@@ -19,6 +19,7 @@ const SAME: [&str; 13] = [
     "width",
     "height",
     "downscale",
+    "mask_as_alpha",
     "background",
     "cameras",
     "appearance",

@@ -51,6 +51,9 @@ pub struct RunConfig {
     pub scene: Scene,
     /// Factor by which the image size was divided. Range: 1 or more.
     pub downscale: usize,
+    /// Whether masks cut out an object: masked pixels are transparent instead of ignored.
+    #[serde(default)]
+    pub mask_as_alpha: bool,
     /// Scene box, and the scene transform that placed the capture in it.
     #[serde(alias = "extent")]
     pub scene_box: SceneBox,
@@ -418,6 +421,7 @@ mod tests {
                 raygrad: "0.1.0".into(),
                 scene: Scene::Embedded,
                 downscale: 2,
+                mask_as_alpha: false,
                 scene_box: SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.5, 4.0]),
                 viewpoint,
                 images: vec![],

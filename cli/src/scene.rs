@@ -52,12 +52,18 @@ impl fmt::Display for Scene {
 }
 
 impl Scene {
-    /// Reads the scene's files and analyses the scene. `asked` overrides the scene type.
-    pub fn open(&self, asked: Option<SceneType>) -> Result<Opened> {
-        let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, asked)) };
+    /// Reads the scene's files and analyses the scene. `asked` overrides the scene type; with `mask_as_alpha` masks cut
+    /// out an object.
+    pub fn open(&self, asked: Option<SceneType>, mask_as_alpha: bool) -> Result<Opened> {
+        let Scene::Folder(folder) = self else {
+            if mask_as_alpha {
+                return Err(Error::setting("mask-as-alpha", "built-in scenes have no masks: leave the flag out"));
+            }
+            return Ok(Opened::new(self, None, asked));
+        };
         let capture = Capture::read(folder)?;
-        let analysis = capture.analyze_scene(asked)?;
-        Ok(Opened::new(self, Some((capture, analysis)), asked))
+        let analysis = if mask_as_alpha { capture.analyze_cutout(asked) } else { capture.analyze_scene(asked) }?;
+        Ok(Opened { mask_as_alpha, ..Opened::new(self, Some((capture, analysis)), asked) })
     }
 
     /// Like [`open`](Self::open), with the scene transform of a model. `unbounded` is true for an unbounded scene.
@@ -87,6 +93,8 @@ impl Scene {
 pub struct Opened {
     /// True to load measured depths with the images.
     pub depth: bool,
+    /// True if masks become alpha.
+    pub mask_as_alpha: bool,
     scene: Scene,
     /// Capture and analysis of a folder.
     pub capture: Option<(Capture, SceneAnalysis)>,
@@ -96,7 +104,7 @@ pub struct Opened {
 
 impl Opened {
     fn new(scene: &Scene, capture: Option<(Capture, SceneAnalysis)>, asked: Option<SceneType>) -> Self {
-        Opened { depth: false, scene: scene.clone(), capture, asked }
+        Opened { depth: false, mask_as_alpha: false, scene: scene.clone(), capture, asked }
     }
 
     /// Loads at most `views` evenly spaced images of a split at `1 / downscale` of their size. Warns of absent images.
@@ -128,10 +136,18 @@ impl Opened {
             Some((capture, analysis)) => {
                 let (progress, words) = (Progress::new(), format!("{split} images read"));
                 let show = |done: usize, total: usize| progress.count(done, total, &words);
+                let mask_as_alpha = self.mask_as_alpha;
                 capture.load(
                     split,
                     analysis,
-                    &LoadOptions { downscale, views, distances: self.depth, memory: None, progress: &show },
+                    &LoadOptions {
+                        downscale,
+                        views,
+                        distances: self.depth,
+                        mask_as_alpha,
+                        memory: None,
+                        progress: &show,
+                    },
                 )?
             }
         };
@@ -163,4 +179,38 @@ fn divides(downscale: usize, [width, height]: [usize; 2]) -> Result<()> {
         return Ok(());
     }
     Err(Error::setting("downscale", format!("{downscale} does not divide the image size {width}x{height}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::Image;
+    use serde_json::json;
+
+    #[test]
+    fn masks_as_alpha_are_loaded_as_an_object() {
+        let folder = tempfile::tempdir().unwrap();
+        let frame = |i: usize| {
+            let mut mask = Image { width: 8, height: 6, channels: 1, data: vec![1.0; 48] };
+            Image::new(8, 6, 3).save_png(folder.path().join(format!("{i}.png"))).unwrap();
+            mask.pixel_mut(3, 2)[0] = 0.0;
+            mask.save_png(folder.path().join(format!("mask{i}.png"))).unwrap();
+            let matrix = json!([[1, 0, 0, i], [0, 1, 0, i * i % 3], [0, 0, 1, 4], [0, 0, 0, 1]]);
+            json!({ "file_path": format!("{i}.png"), "mask_path": format!("mask{i}.png"), "transform_matrix": matrix })
+        };
+        let transforms = json!({ "fl_x": 9.0, "frames": (0..3).map(frame).collect::<Vec<_>>() });
+        std::fs::write(folder.path().join("transforms.json"), transforms.to_string()).unwrap();
+        let scene = Scene::Folder(folder.path().to_owned());
+        for mask_as_alpha in [false, true] {
+            let opened = scene.open(None, mask_as_alpha).unwrap();
+            let data = opened.load(Split::Train, 1, usize::MAX).unwrap();
+            assert_eq!(data.scene_type == SceneType::Bounded, mask_as_alpha);
+            let frame = &data.frames[0];
+            assert_eq!((frame.image.has_alpha(), frame.mask.is_some()), (mask_as_alpha, !mask_as_alpha));
+            let [hidden, used] = [[3, 2], [4, 2]].map(|[x, y]| frame.image.pixel(x, y)[3]);
+            assert_eq!((hidden, used), (f32::from(u8::from(!mask_as_alpha)), 1.0));
+        }
+        let message = Scene::Embedded.open(None, true).err().unwrap().to_string();
+        assert_eq!(message, "`mask-as-alpha`: built-in scenes have no masks: leave the flag out");
+    }
 }

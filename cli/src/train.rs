@@ -37,7 +37,7 @@ const RETREATS: u32 = 3;
 const FINISHED: &str = ", the end of its budget: add --steps or --budget with a larger total to train on";
 
 /// Options of new runs only.
-const NEW: [&str; 15] = [
+const NEW: [&str; 16] = [
     "scene",
     "preset",
     "skip",
@@ -49,6 +49,7 @@ const NEW: [&str; 15] = [
     "refine",
     "depth_loss",
     "near",
+    "mask_as_alpha",
     "loss",
     "out",
     "no_positional_encoding",
@@ -115,6 +116,12 @@ pub struct Args {
     /// and cameras, and prints it with the reason.
     #[arg(long, help_heading = "Scene", value_name = "TYPE", value_parser = parse::word::<SceneType>)]
     scene_type: Option<SceneType>,
+    /// Masks cut out an object: make the rest transparent
+    ///
+    /// Without the flag, pixels that a mask hides are ignored, and the model may put anything there. With it, the
+    /// model learns that nothing is there. Every image needs a mask or transparency.
+    #[arg(long, help_heading = "Scene")]
+    mask_as_alpha: bool,
     /// Background: white, black or random
     ///
     /// Lies behind transparent images, and behind opaque ones too if given. The default for transparent images is
@@ -240,7 +247,7 @@ pub fn run(args: &Args) -> Result<Trained> {
 /// Trains a new run.
 fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
-    let mut scene = args.scene.open(args.scene_type)?;
+    let mut scene = args.scene.open(args.scene_type, args.mask_as_alpha)?;
     scene.depth = args.has_depth_loss();
     let mut data = scene.load(Split::Train, args.downscale, usize::MAX)?;
     if let Some(near) = args.near {
@@ -268,6 +275,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
         (None, None) => return Err(Error::setting("budget", "the run has none: add --budget or --steps")),
     };
     let mut scene = run.scene(None)?.open_for(&extent, config.unbounded)?;
+    scene.mask_as_alpha = run.config.mask_as_alpha;
     scene.depth = config.loss_terms.iter().any(|term| term.kind() == "depth");
     let data = scene.load(Split::Train, downscale, usize::MAX)?;
     let [near, far] = extent.near_far;

@@ -142,7 +142,8 @@ pub fn run(args: &Args) -> Result<()> {
         model.set_skip(skip);
     }
     let scene = run.scene(args.scene.as_ref())?;
-    let opened = scene.open_for(&run.config.scene_box, run.config.config.unbounded)?;
+    let mut opened = scene.open_for(&run.config.scene_box, run.config.config.unbounded)?;
+    opened.mask_as_alpha = run.config.mask_as_alpha;
     let mut data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
     if args.split != Split::Train
         && let Some(frame) = data.frames.iter().find(|frame| run.config.images.contains(&frame.name))
@@ -197,6 +198,7 @@ pub fn run(args: &Args) -> Result<()> {
         width: data.frames[0].image.width,
         height: data.frames[0].image.height,
         downscale: run.config.downscale,
+        mask_as_alpha: run.config.mask_as_alpha,
         background,
         skip,
         precision: args.precision,

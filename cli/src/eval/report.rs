@@ -33,6 +33,9 @@ pub struct Report {
     pub width: usize,
     pub height: usize,
     pub downscale: usize,
+    /// True if masks are the alpha of the images.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub mask_as_alpha: bool,
     /// Background of transparent images.
     pub background: Background,
     /// Skipping; null without an occupancy grid.

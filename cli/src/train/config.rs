@@ -77,6 +77,7 @@ impl Args {
             raygrad: env!("CARGO_PKG_VERSION").to_owned(),
             scene: self.scene.absolute()?,
             downscale: self.downscale,
+            mask_as_alpha: self.mask_as_alpha,
             scene_box: trainer.model.scene_box,
             viewpoint: Viewpoint::of(data),
             images: data.frames.iter().map(|frame| frame.name.clone()).collect(),

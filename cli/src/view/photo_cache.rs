@@ -29,6 +29,8 @@ pub struct PhotoCache {
     scene: Scene,
     /// Downscale factor of training and evaluation.
     downscale: usize,
+    /// True if masks are alpha, as in training.
+    mask_as_alpha: bool,
     entries: Vec<Entry>,
     /// The best points of the capture, in scene coordinates.
     points: Vec<(DVec3, [u8; 3])>,
@@ -77,9 +79,9 @@ impl PhotoCache {
             }));
         }
         let points = best(&capture.points).map(|point| (transform.point(point.position), point.color)).collect();
-        let downscale = run.config.downscale;
+        let (downscale, mask_as_alpha) = (run.config.downscale, run.config.mask_as_alpha);
         let (kept, made) = (Cache::new(KEPT), Mutex::default());
-        Ok(PhotoCache { capture, scene, downscale, entries, points, kept, made, width })
+        Ok(PhotoCache { capture, scene, downscale, mask_as_alpha, entries, points, kept, made, width })
     }
 
     /// Returns true if an image has this number.
@@ -121,7 +123,8 @@ impl PhotoCache {
     /// embedding.
     pub fn is_special(&self, number: usize, model: &Model<f32>) -> bool {
         let own = |entry: &Entry| Appearance::of(model, entry.split, false) == Appearance::Own;
-        self.entries.get(number).is_some_and(|entry| entry.view.mask.is_some() || own(entry))
+        let is_masked = |entry: &Entry| entry.view.mask.is_some() && !self.mask_as_alpha;
+        self.entries.get(number).is_some_and(|entry| is_masked(entry) || own(entry))
     }
 
     /// The image whose camera is nearest in position and direction.
@@ -155,6 +158,7 @@ impl PhotoCache {
         let entry = self.entries.get(number);
         let entry = entry.ok_or_else(|| Error::setting("image", format!("there is no image {number}")))?;
         let photo = match &self.scene {
+            Scene::Folder(_) if self.mask_as_alpha => self.capture.cutout(&entry.view)?,
             Scene::Folder(_) => self.capture.photo(&entry.view)?,
             made => self.made(made, entry)?,
         };
@@ -234,7 +238,17 @@ mod tests {
         };
         let entries = places.iter().map(entry).collect();
         let (kept, made) = (Cache::new(KEPT), Mutex::default());
-        PhotoCache { capture, scene, downscale: 1, entries, points: vec![], kept, made, width: 16 }
+        PhotoCache {
+            capture,
+            scene,
+            downscale: 1,
+            mask_as_alpha: false,
+            entries,
+            points: vec![],
+            kept,
+            made,
+            width: 16,
+        }
     }
 
     fn model(bounds: [DVec3; 2], cameras: &[Camera], learns: bool) -> Model<f32> {
@@ -297,6 +311,9 @@ mod tests {
         assert!(!photos.is_special(0, &model) && !photos.is_special(7, &model));
         photos.entries[0].view.mask = Some(PathBuf::from("mask.png"));
         assert!(photos.is_special(0, &model) && !photos.is_special(1, &model));
+        photos.mask_as_alpha = true;
+        assert!(!photos.is_special(0, &model), "the page shows the same alpha");
+        photos.mask_as_alpha = false;
         // The size of training.
         let at = |photos: &PhotoCache, size: [usize; 2]| photos.is_evaluated_at(1, size);
         assert_eq!([[40, 30], [20, 15], [39, 30], [40, 29]].map(|size| at(&photos, size)), [true, false, false, false]);

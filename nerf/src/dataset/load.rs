@@ -48,6 +48,9 @@ pub struct LoadOptions<'a> {
     pub views: usize,
     /// Whether to read [distances](Frame::distances) from [depth files](View::depth), which take four bytes per pixel.
     pub distances: bool,
+    /// Whether [masks](View::mask) cut out an object: their black pixels become transparent instead of unused, and grey
+    /// ones partly transparent. [`Capture::analyze_cutout`] analyses such a scene.
+    pub mask_as_alpha: bool,
     /// The most bytes of memory for images, while they are decoded and afterwards; `None` for the
     /// [free memory](crate::available_memory).
     pub memory: Option<u64>,
@@ -57,7 +60,14 @@ pub struct LoadOptions<'a> {
 
 impl Default for LoadOptions<'_> {
     fn default() -> Self {
-        LoadOptions { downscale: 1, views: usize::MAX, distances: false, memory: None, progress: &|_, _| {} }
+        LoadOptions {
+            downscale: 1,
+            views: usize::MAX,
+            distances: false,
+            mask_as_alpha: false,
+            memory: None,
+            progress: &|_, _| {},
+        }
     }
 }
 
@@ -212,6 +222,15 @@ impl Capture {
         (median(factors).ceil() as usize).max(1)
     }
 
+    /// [Analyses](Self::analyze_scene) a scene whose masks [cut out an object](LoadOptions::mask_as_alpha): the
+    /// background is empty.
+    ///
+    /// # Errors
+    /// As [`SceneAnalysis::new`].
+    pub fn analyze_cutout(&self, asked: Option<SceneType>) -> Result<SceneAnalysis> {
+        SceneAnalysis::new(self, Some("masks cut out an object"), asked)
+    }
+
     /// Reads one image at full size, in the orientation of its camera, without its mask.
     ///
     /// # Errors
@@ -221,13 +240,22 @@ impl Capture {
         self.named(view, open(path, &view.camera))
     }
 
+    /// Reads one image as [`photo`](Self::photo) does, with its mask [as alpha](LoadOptions::mask_as_alpha).
+    ///
+    /// # Errors
+    /// As [`photo`](Self::photo), and if the mask cannot be decoded or has another aspect ratio.
+    pub fn cutout(&self, view: &View) -> Result<Photo> {
+        self.named(view, cut_out(self.photo(view)?, view))
+    }
+
     /// Reads the images of a split, in parallel, and maps their cameras to the scene by `analysis`.
     ///
     /// # Errors
-    /// If none of the split's images exists, an image cannot be decoded or has another aspect ratio than its camera, or
-    /// `downscale` or `views` is 0. Which of several errors is reported does not depend on timing. Single absent images
-    /// are not an error: see [`Dataset::skipped`]. Before any image is decoded: if all of them together need more than
-    /// [`LoadOptions::memory`].
+    /// If none of the split's images exists, an image or mask cannot be decoded or has another aspect ratio than its
+    /// camera, or `downscale` or `views` is 0. Which of several errors is reported does not depend on timing. Single
+    /// absent images are not an error: see [`Dataset::skipped`]. Before any image is decoded: if all of them together
+    /// need more than [`LoadOptions::memory`], or an image has neither a mask nor transparency with
+    /// [`LoadOptions::mask_as_alpha`].
     pub fn load(&self, split: Split, analysis: &SceneAnalysis, reading: &LoadOptions<'_>) -> Result<Dataset> {
         reading.check()?;
         let (present, absent): (Vec<&View>, Vec<&View>) =
@@ -305,6 +333,8 @@ struct Plan<'a> {
     size: [usize; 2],
     /// The size after downscaling.
     to: [usize; 2],
+    /// True if the mask becomes alpha.
+    is_cut: bool,
     /// Bytes of a pixel after it is loaded, with its distance.
     pixel: u64,
     /// The most bytes while the image, its mask and its depths are decoded.
@@ -315,21 +345,38 @@ impl<'a> Plan<'a> {
     fn new(
         capture: &Capture,
         view: &'a View,
-        LoadOptions { downscale, distances, .. }: LoadOptions<'_>,
+        LoadOptions { downscale, distances, mask_as_alpha, .. }: LoadOptions<'_>,
     ) -> Result<Self> {
         let Some(path) = &view.image else { return Err(Error::file(&view.name, "does not exist")) };
         let (path, downscale) = made_smaller(&capture.folder, path, downscale);
         let header = Header::read(&path)?;
         let size = fitting(&header, &path, &view.camera)?;
         let to = size.map(|side| ((side as f64 / downscale as f64).round() as usize).max(1));
-        let mask = view.mask.as_ref().map_or(Ok(0), Photo::decoding_memory)?;
+        let is_cut = mask_as_alpha && view.mask.is_some();
+        if mask_as_alpha && !is_cut && header.channels == 3 {
+            // Other images say that its background is empty.
+            let what = "has no mask to cut out the object, and no transparency: add its mask, or use masks to ignore \
+                        pixels (without --mask-as-alpha)";
+            return Err(Error::file(path, what));
+        }
+        let bytes = |pixel: u64, [width, height]: [usize; 2]| pixel.saturating_mul((width * height) as u64);
         let depth = view.depth.as_ref().filter(|_| distances);
-        let pixel = header.pixel + if depth.is_some() { 4 } else { 0 };
-        let depth = depth.map_or(Ok(0), |(path, _)| Depths::decoding_memory(path))?;
+        let rgba = if is_cut { header.pixel / header.channels * 4 } else { header.pixel };
+        let pixel = rgba + if depth.is_some() { 4 } else { 0 };
+        let mut decoding = header.decoding;
+        if let Some(mask) = &view.mask {
+            // The mask, and its copy in the size of the image; then the image with alpha.
+            let mask = Header::read(mask)?;
+            let copies = if is_cut { bytes(mask.pixel + rgba, size) } else { bytes(mask.pixel, to) };
+            decoding = decoding.saturating_add(mask.decoding).saturating_add(copies);
+        }
+        if let Some((path, _)) = depth {
+            decoding = decoding.saturating_add(Depths::decoding_memory(path)?);
+        }
         // Masks have a bit and a share of a count per pixel; that of a lens has a byte while it is computed.
-        let is_masked = view.mask.is_some() || view.camera.lens != Lens::Pinhole;
+        let is_masked = view.mask.is_some() && !is_cut || view.camera.lens != Lens::Pinhole;
         let pixel = pixel + u64::from(is_masked);
-        Ok(Plan { view, path, size, to, pixel, decoding: header.decoding.saturating_add(mask).saturating_add(depth) })
+        Ok(Plan { view, path, size, to, is_cut, pixel, decoding })
     }
 
     /// Bytes of the loaded image.
@@ -338,11 +385,13 @@ impl<'a> Plan<'a> {
     }
 
     fn frame(&self, transform: &SceneTransform, lit: &Lit, is_measured: bool) -> Result<Frame> {
-        let Plan { view, path, size, to, .. } = self;
+        let Plan { view, path, size, to, is_cut, .. } = self;
         let photo = Photo::open(path, Some(*size))?;
+        // Before downscaling, which weighs colours by alpha: the background does not bleed into the object.
+        let photo = if *is_cut { cut_out(photo, view)? } else { photo };
         let image = if [photo.width, photo.height] == *to { photo } else { photo.resized(*to) };
         let camera = view.camera.resized(to[0], to[1]);
-        let given = view.mask.as_ref().map(|path| read_mask(path, *size, *to)).transpose()?;
+        let given = view.mask.as_ref().filter(|_| !is_cut).map(|path| used_pixels(path, *size, *to)).transpose()?;
         let mask = match (given, lit.of(&camera)) {
             (Some(given), Some(lit)) => {
                 Some(Arc::new(Mask::new(to[0], to[1], |x, y| given.uses(x, y) && lit.uses(x, y))))
@@ -420,20 +469,32 @@ pub(crate) fn same_shape([width, height]: [usize; 2], camera: &Camera) -> bool {
     cw > 0.0 && ch > 0.0 && (w * ch - h * cw).abs() <= 0.51 * cw.max(ch).max(w).max(h)
 }
 
-/// Reads a mask (white for used pixels) of an image of the size `of`, downscaled to the size `to`.
-fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
+/// Makes the pixels transparent that the mask of a view, if there is one, does not use.
+fn cut_out(photo: Photo, view: &View) -> Result<Photo> {
+    let Some(mask) = &view.mask else { return Ok(photo) };
+    let size = [photo.width, photo.height];
+    Ok(photo.masked(&read_mask(mask, size, size)?))
+}
+
+/// Reads the used pixels of an image of the size `of`, downscaled to the size `to`, from its mask.
+fn used_pixels(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
+    let mask = read_mask(path, of, to)?;
+    Ok(Mask::new(to[0], to[1], |x, y| mask.pixel(x, y)[0] >= WHITE))
+}
+
+/// Reads a mask (white for used pixels) of an image of the size `of`, resampled to the size `to`.
+fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Photo> {
     let mask = Photo::open(path, Some(of))?;
-    let [width, height] = to;
-    let shape = (mask.width * of[1]).abs_diff(mask.height * of[0]) <= of[0].max(of[1]);
-    if !shape || mask.width < width || mask.height < height {
-        let what = format!(
-            "has {}x{} pixels but its image {}x{}; use one aspect ratio",
-            mask.width, mask.height, of[0], of[1]
-        );
+    let from = [mask.width, mask.height];
+    if (from[0] * of[1]).abs_diff(from[1] * of[0]) > of[0].max(of[1]) {
+        let what =
+            format!("has {}x{} pixels but its image {}x{}; use one aspect ratio", from[0], from[1], of[0], of[1]);
         return Err(Error::file(path, what));
     }
-    let mask = mask.resized(to);
-    Ok(Mask::new(width, height, |x, y| mask.pixel(x, y)[0] >= WHITE))
+    Ok(match (0..2).all(|axis| from[axis] >= to[axis]) {
+        true => mask.resized(to),
+        false => mask.resampled(to, |place| [0, 1].map(|axis| place[axis] * from[axis] as f64 / to[axis] as f64)),
+    })
 }
 
 /// The pixels that each lens sees, computed once per camera.

@@ -206,12 +206,35 @@ impl Photo {
         };
         Photo { width, height, channels: self.channels, values }
     }
+
+    /// Multiplies alpha by the red values of a mask of the same size, so that its black pixels become transparent.
+    pub(super) fn masked(&self, mask: &Photo) -> Photo {
+        let alpha = mask.pixels().map(|pixel| pixel[0]);
+        let values = match &self.values {
+            Values::Bytes(values) => Values::Bytes(with_alpha(values, self.channels, alpha)),
+            Values::Words(values) => Values::Words(with_alpha(values, self.channels, alpha)),
+            Values::Floats(values) => Values::Floats(with_alpha(values, self.channels, alpha)),
+        };
+        Photo { width: self.width, height: self.height, channels: 4, values }
+    }
+}
+
+/// RGBA of pixels, with their alpha times another.
+fn with_alpha<S: Stored>(values: &[S], channels: usize, alpha: impl Iterator<Item = f32>) -> Vec<S> {
+    let mut out = Vec::with_capacity(values.len() / channels * 4);
+    for (pixel, alpha) in values.chunks_exact(channels).zip(alpha) {
+        let own = pixel.get(3).map_or(1.0, |own| own.unit());
+        out.extend([pixel[0], pixel[1], pixel[2], S::nearest(f64::from(own * alpha))]);
+    }
+    out
 }
 
 /// The header of an image file.
 pub(super) struct Header {
     /// Width and height as stored, and after the EXIF orientation.
     pub sizes: [[usize; 2]; 2],
+    /// Values per pixel of the [`Photo`].
+    pub channels: u64,
     /// Bytes of a pixel of the [`Photo`].
     pub pixel: u64,
     /// The most bytes of memory while it is decoded.
@@ -248,7 +271,7 @@ impl Header {
             _ => 0,
         };
         let decoding = decoded + converted.max(turned).max(inner);
-        Header { sizes: [stored, turned_size(stored, turn)], pixel, decoding }
+        Header { sizes: [stored, turned_size(stored, turn)], channels, pixel, decoding }
     }
 }
 

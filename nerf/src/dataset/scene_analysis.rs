@@ -99,7 +99,8 @@ impl SceneAnalysis {
                 }
             }
         };
-        let depths: Vec<[f64; 2]> = capture.present().filter_map(|view| view.bounds).collect();
+        let depths: Vec<(&Camera, [f64; 2])> =
+            capture.present().filter_map(|view| Some((&view.camera, view.bounds?))).collect();
         let points = trusted(&capture.points);
         let Layout { middle, inner, looks } = Layout::new(&cameras, &depths, &points);
         let sideways = if is_sideways(&cameras) { "; all images are on their side" } else { "" };
@@ -123,7 +124,7 @@ impl SceneAnalysis {
                 [(nearest - reach).max(NEAR_SHARE * distance), distances().fold(0.0, f64::max) + reach]
             }
             SceneType::Unbounded | SceneType::ForwardFacing => {
-                let given = depths.iter().map(|[near, _]| *near).reduce(f64::min);
+                let given = depths.iter().map(|(_, [near, _])| *near).reduce(f64::min);
                 let near = given.or_else(|| nearest_point(&cameras, &points));
                 let near = near.map_or(NEAR_SHARE * distance, |near| 0.5 * near);
                 [near.min(0.5 * distance), FAR_SIDES * 2.0 * half]
@@ -168,12 +169,12 @@ struct Layout {
 }
 
 impl Layout {
-    /// `depths` are the nearest and farthest depths of each camera, if all are known. `points` are a sample of the
-    /// visible points.
-    fn new(cameras: &[&Camera], depths: &[[f64; 2]], points: &[DVec3]) -> Self {
+    /// `depths` are the nearest and farthest depths of the cameras with known ones, which count if they are at least
+    /// half of all. `points` are a sample of the visible points.
+    fn new(cameras: &[&Camera], depths: &[(&Camera, [f64; 2])], points: &[DVec3]) -> Self {
         let distances = |middle: DVec3| median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
-        if depths.len() == cameras.len() {
-            let middle = ahead(cameras, depths);
+        if 2 * depths.len() >= cameras.len() {
+            let middle = ahead(depths);
             return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "depths give its position" };
         }
         if let Some(middle) = middle(cameras) {
@@ -232,8 +233,8 @@ fn average(cameras: &[&Camera], of: fn(&DAffine3) -> DVec3) -> DVec3 {
 }
 
 /// The centre of the scene for cameras with known near and far depths: halfway in inverse depth along the axes.
-fn ahead(cameras: &[&Camera], depths: &[[f64; 2]]) -> DVec3 {
-    mean(cameras.iter().zip(depths).map(|(camera, [near, far])| {
+fn ahead(depths: &[(&Camera, [f64; 2])]) -> DVec3 {
+    mean(depths.iter().map(|(camera, [near, far])| {
         camera.pose.translation - camera.pose.matrix3.z_axis * (2.0 / (1.0 / near + 1.0 / far))
     }))
 }

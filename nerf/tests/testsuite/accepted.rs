@@ -188,7 +188,9 @@ fn damage_again_and_again(kind: Kind) {
         }
     });
     let [accepted, refused] = tally.counts();
-    assert!(accepted > 5 && trained.get() > 5 && refused > 5, "{kind:?}: {accepted} accepted, {refused} refused");
+    assert!(accepted > 5 && trained.get() > 5, "{kind:?}: {accepted} accepted");
+    // Damaged points are left out.
+    assert_eq!(refused > 5, kind != Kind::Ply, "{kind:?}: {refused} refused");
 }
 
 #[test]
@@ -223,32 +225,41 @@ fn campaign_llff() {
 
 /// Counts and sizes that no memory could hold.
 #[test]
-fn captures_announcing_huge_sizes_are_errors() {
+fn captures_announcing_huge_sizes_take_little_memory() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    let refused = |kind: Kind, file: usize, change: &(dyn Fn(&mut Vec<u8>) + Sync)| {
+    let result_of = |kind: Kind, file: usize, change: &(dyn Fn(&mut Vec<u8>) + Sync)| {
         let folder = tempfile::tempdir().unwrap();
         let files = kind.write(folder.path());
         let mut bytes = std::fs::read(&files[file]).unwrap();
         change(&mut bytes);
         std::fs::write(&files[file], &bytes).unwrap();
         let (result, taken) = pool.install(|| peak(|| read(folder.path())));
-        clear(result.err().unwrap_or_else(|| panic!("{kind:?} {file} is accepted")), folder.path().to_str().unwrap());
         assert!(taken <= 1 << 20, "{kind:?} {file}: {taken} bytes of memory");
+        result.map(|(capture, _)| capture).map_err(|error| clear(error, folder.path().to_str().unwrap()))
+    };
+    let refused = |kind: Kind, file: usize, change: &(dyn Fn(&mut Vec<u8>) + Sync)| {
+        assert!(result_of(kind, file, change).is_err(), "{kind:?} {file} is accepted");
+    };
+    // Points that the file does not hold are left out.
+    let points = |kind: Kind, file: usize, change: &(dyn Fn(&mut Vec<u8>) + Sync)| {
+        let capture = result_of(kind, file, change).unwrap();
+        assert_eq!((capture.points.len(), capture.assumptions.len()), (40, 1), "{:?}", capture.assumptions);
     };
     let replace = |bytes: &mut Vec<u8>, from: &str, to: &str| {
         let start = bytes.windows(from.len()).position(|part| part == from.as_bytes()).expect(from);
         bytes.splice(start..start + from.len(), to.bytes());
     };
     for count in [1 << 62, u64::MAX, u64::MAX / 64 + 2, 1 << 40, 100_000] {
-        for file in 0..3 {
+        for file in 0..2 {
             refused(Kind::ColmapBinary, file, &|bytes| bytes[..8].copy_from_slice(&count.to_le_bytes()));
         }
+        points(Kind::ColmapBinary, 2, &|bytes| bytes[..8].copy_from_slice(&count.to_le_bytes()));
         // The observations of the first image; then an endless name.
         refused(Kind::ColmapBinary, 1, &|bytes| {
             let end = 8 + 64 + bytes[72..].iter().position(|byte| *byte == 0).unwrap() + 1;
             bytes[end..end + 8].copy_from_slice(&count.to_le_bytes());
         });
-        refused(Kind::Ply, 0, &|bytes| replace(bytes, "element vertex 40", &format!("element vertex {count}")));
+        points(Kind::Ply, 0, &|bytes| replace(bytes, "element vertex 40", &format!("element vertex {count}")));
         refused(Kind::Llff, 0, &|bytes| replace(bytes, "(5, 17)", &format!("({count}, 17)")));
         refused(Kind::Llff, 0, &|bytes| replace(bytes, "(5, 17)", &format!("({count}, {count})")));
         // Smaller widths may be valid.

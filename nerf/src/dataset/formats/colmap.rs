@@ -15,8 +15,9 @@ mod table;
 mod text;
 
 use super::limits::start;
+use super::points::Points;
 use crate::camera::pinhole::Camera;
-use crate::dataset::capture::{Capture, Format, Point, View};
+use crate::dataset::capture::{Capture, Format, View};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use entries::{ImageEntry, Place};
@@ -62,12 +63,13 @@ pub(super) fn images_beside(file: &Path) -> Option<PathBuf> {
     files.find(|files| files.iter().any(|other| other == file)).map(|[_, images, _]| images)
 }
 
-/// Reads the cameras and points of `folder`, views in the order of their names. No image is decoded.
+/// Reads the cameras and points of `folder`, views in the order of their names. No image is decoded. Damaged points are
+/// left out, which [`Capture::assumptions`] says.
 ///
 /// # Errors
-/// If a file is absent or damaged, an image has no camera, an identifier or name is duplicated, a camera model is not
-/// supported, or a number is not finite. The error names the file and the entry or line. Single images with an invalid
-/// camera or pose are no error: they are left out with an [assumption](Capture::assumptions).
+/// If a file of cameras or images is absent or damaged, an image has no camera, an identifier or name is duplicated, a
+/// camera model is not supported, or a number is not finite. The error names the file and the entry or line. Single
+/// images with an invalid camera or pose are no error: they are left out with an [assumption](Capture::assumptions).
 pub fn read(folder: &Path) -> Result<Capture> {
     let what = "has no COLMAP model: expected cameras.bin and images.bin, or both as .txt, in sparse/0";
     let model = models(folder).into_iter().next().ok_or_else(|| Error::file(folder, what))?;
@@ -83,8 +85,8 @@ pub(super) fn read_model(folder: &Path, images: &Path) -> Result<Capture> {
     let content = |file: &Path| std::fs::read(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")));
     let [cameras, images, points] = &files;
     // Models with known cameras may have no points.
-    let points = if points.is_file() { Some(content(points)?) } else { None };
-    let mut capture = parse(folder, encoding, &files, [&content(cameras)?, &content(images)?], points.as_deref())?;
+    let points = points.is_file().then(|| std::fs::read(points));
+    let mut capture = parse(folder, encoding, &files, [&content(cameras)?, &content(images)?], points)?;
     beside::attach(&mut capture, model)?;
     Ok(capture)
 }
@@ -119,17 +121,12 @@ fn parse(
     encoding: Encoding,
     files: &[PathBuf; 3],
     [cameras, images]: [&[u8]; 2],
-    points: Option<&[u8]>,
+    points: Option<std::io::Result<Vec<u8>>>,
 ) -> Result<Capture> {
     let [cameras_file, images_file, points_file] = files;
     let (cameras, images) = match encoding {
         Encoding::Binary => (binary::cameras(cameras_file, cameras)?, binary::images(images_file, images)?),
         Encoding::Text => (text::cameras(cameras_file, cameras)?, text::images(images_file, images)?),
-    };
-    let points: Vec<Point> = match (points, encoding) {
-        (None, _) => vec![],
-        (Some(points), Encoding::Binary) => binary::points(points_file, points)?,
-        (Some(points), Encoding::Text) => text::points(points_file, points)?,
     };
     distinct(cameras_file, "camera_id", cameras.iter().map(|entry| (entry.id, entry.place)))?;
     distinct(images_file, "image_id", images.iter().map(|entry| (entry.id, entry.place)))?;
@@ -169,9 +166,15 @@ fn parse(
             .push(format!("left out {count} of {total} images without a valid camera, such as `{name}`: {error}"));
     }
     views.sort_by(|a, b| a.name.cmp(&b.name));
-    let points_file = Some(points_file.clone()).filter(|_| !points.is_empty());
     let capture = Capture::new(folder, images_file.clone(), Format::Colmap, views);
-    Ok(Capture { points, points_file, assumptions, ..capture })
+    let mut capture = Capture { assumptions, ..capture };
+    let points = points.map(|bytes| match (bytes, encoding) {
+        (Err(error), _) => Points::unreadable(format!("cannot be read: {error}")),
+        (Ok(bytes), Encoding::Binary) => binary::points(points_file, &bytes),
+        (Ok(bytes), Encoding::Text) => text::points(points_file, &bytes),
+    });
+    points.unwrap_or_default().attach(&mut capture, points_file);
+    Ok(capture)
 }
 
 /// Checks that no two entries of a list have the same key.

@@ -2,11 +2,11 @@
 //!
 //! The first 15 are a 3x5 matrix: the camera's directions down, right and backwards, its position, and height, width
 //! and focal length in pixels. The last two are the nearest and farthest depth. Rows belong to the images of the folder
-//! `images` in the order of their names.
+//! `images` in the order of their names, or to those of them that `view_imgs.txt` lists.
 
-use super::limits::MOST_PIXELS;
+use super::limits::{MOST_PIXELS, start};
 use super::npy::Matrix;
-use super::rigid;
+use super::{masks, rigid};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
@@ -16,6 +16,8 @@ use glam::{DAffine3, DMat3, DVec3};
 use std::path::{Path, PathBuf};
 
 const FILE: &str = "poses_bounds.npy";
+/// The names of the images with a pose, by LLFF's `imgs2poses` of many tools.
+const LIST: &str = "view_imgs.txt";
 const COLUMNS: usize = 17;
 const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
@@ -24,15 +26,17 @@ pub(super) fn file(folder: &Path) -> PathBuf {
     folder.join(FILE)
 }
 
-/// Reads the cameras of `folder`. No image is decoded.
+/// Reads the cameras of `folder`. No image is decoded. Invalid depths are left out, which [`Capture::assumptions`] says.
 ///
 /// # Errors
-/// If a file is absent or damaged, the numbers of images and cameras differ, or a number is not valid for a camera. The
-/// error names the file and the row, counted from 0.
+/// If a file is absent or damaged, a number is not valid for a camera, or the numbers of images and cameras differ
+/// without a `view_imgs.txt`. The error names the file and the row, counted from 0.
 pub fn read(folder: &Path) -> Result<Capture> {
     let file = file(folder);
     let bytes = std::fs::read(&file).map_err(|e| Error::file(&file, format!("cannot be read: {e}")))?;
-    parse(folder, &bytes, images(folder)?)
+    let mut capture = parse(folder, &bytes, images(folder)?)?;
+    masks::attach(&mut capture, &[folder.to_owned()]);
+    Ok(capture)
 }
 
 /// [`read`] for the bytes of the file and the images of the folder.
@@ -46,27 +50,82 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
     if matrix.rows == 0 {
         return Err(shape("has no rows: add one per image".into()));
     }
-    if matrix.rows != images.len() {
-        let beside =
-            images.first().and_then(|(_, path)| path.parent()).map_or("".into(), |p| format!(" in {}", p.display()));
-        let what = "give each row its image, in the order of their names";
-        return Err(shape(format!("has {} rows, but there are {} images{beside}: {what}", matrix.rows, images.len())));
+    let (count, mut assumptions) = (images.len(), vec![]);
+    let mut images: Vec<(String, Option<PathBuf>)> =
+        images.into_iter().map(|(name, path)| (name, Some(path))).collect();
+    if matrix.rows != count {
+        images = listed(folder, matrix.rows, images)?;
+        assumptions.push(format!("took the images of the {} rows from `{LIST}`, of {count} images", matrix.rows));
     }
-    let rows = matrix.values.chunks_exact(COLUMNS).zip(images).enumerate();
-    let views = rows.map(|(index, (row, (name, path)))| {
+    let (mut views, mut invalid) = (Vec::with_capacity(matrix.rows), vec![]);
+    for (index, (row, (name, image))) in matrix.values.chunks_exact(COLUMNS).zip(images).enumerate() {
         let field = format!("row {index}");
         let bad = |what| Error::field(&file, &field, what);
         let row = row.try_into().map_err(|_| bad("must have 17 numbers".into()))?;
         let (camera, bounds) = camera(row).map_err(bad)?;
-        Ok(View { image: Some(path), bounds: Some(bounds), ..View::new(name, field, camera) })
-    });
-    let views = views.collect::<Result<_>>()?;
-    Ok(Capture::new(folder, file, Format::Llff, views))
+        if bounds.is_none() {
+            invalid.push(format!("row {index} has {} and {}", row[15], row[16]));
+        }
+        views.push(View { image, bounds, ..View::new(name, field, camera) });
+    }
+    if let Some(first) = invalid.first() {
+        let what = "must be at least 0 and rise";
+        assumptions.push(format!(
+            "ignored the depths of {} of {} rows, which {what}: {first}",
+            invalid.len(),
+            views.len()
+        ));
+    }
+    Ok(Capture { assumptions, ..Capture::new(folder, file, Format::Llff, views) })
 }
 
-/// The camera of a row and the depth bounds of its image.
-fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, [f64; 2]), String> {
-    if let Some(column) = row.iter().position(|value| !value.is_finite()) {
+/// The images of the rows, as `view_imgs.txt` lists them.
+fn listed(
+    folder: &Path,
+    rows: usize,
+    images: Vec<(String, Option<PathBuf>)>,
+) -> Result<Vec<(String, Option<PathBuf>)>> {
+    let file = folder.join(LIST);
+    let bad = |what: String| Err(Error::file(&file, what));
+    if !file.is_file() {
+        let beside = images.first().and_then(|(_, path)| path.as_ref()?.parent());
+        let beside = beside.map_or("".into(), |folder| format!(" in {}", folder.display()));
+        let what = format!(
+            "has {rows} rows, but there are {} images{beside}: give each row its image, in the order of their names, or \
+            list the names of the rows' images in {LIST}",
+            images.len()
+        );
+        return Err(Error::field(folder.join(FILE), "shape", what));
+    }
+    let text = std::fs::read_to_string(&file).map_err(|e| Error::file(&file, format!("cannot be read: {e}")))?;
+    let names = text.trim_start_matches('\u{feff}').lines().map(|line| line.trim().rsplit(['/', '\\']).next());
+    let names: Vec<&str> = names.flatten().filter(|name| !name.is_empty()).collect();
+    if names.len() != rows {
+        return bad(format!("has {} names, but {FILE} has {rows} rows: list the image of each row", names.len()));
+    }
+    // LLFF writes rows and names in the order of the names.
+    if let Some(pair) = names.windows(2).find(|pair| pair[0] >= pair[1]) {
+        let [first, second] = [0, 1].map(|i| start(pair[i]));
+        return bad(match first == second {
+            true => format!("lists `{first}` twice: list the image of each row"),
+            false => format!(
+                "lists `{second}` after `{first}`: rows may follow these lines or, as LLFF writes them, the names; \
+                sort the lines if they follow the names, otherwise sort the rows too"
+            ),
+        });
+    }
+    let stem = |name: &str| Path::new(name).file_stem().map(|stem| stem.to_ascii_lowercase());
+    // Downscaled images may have another extension.
+    let found = |name: &str| {
+        let exact = images.iter().find(|(own, _)| own == name);
+        exact.or_else(|| images.iter().find(|(own, _)| stem(own) == stem(name))).cloned()
+    };
+    Ok(names.into_iter().map(|name| found(name).unwrap_or_else(|| (name.to_owned(), None))).collect())
+}
+
+/// The camera of a row and the depth bounds of its image, if these are valid.
+fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, Option<[f64; 2]>), String> {
+    if let Some(column) = row[..15].iter().position(|value| !value.is_finite()) {
         return Err(format!("column {column} is not a finite number"));
     }
     let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
@@ -81,12 +140,9 @@ fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, [f64; 2]), Strin
     if focal <= 0.0 {
         return Err(format!("focal length must be more than 0, is {focal}"));
     }
-    let [near, far] = [row[15], row[16]];
-    if !(near >= 0.0 && far > near) {
-        return Err(format!("depths must be at least 0 and rise, are {near} and {far}"));
-    }
+    let bounds = Some([row[15], row[16]]).filter(|[near, far]| *near >= 0.0 && far > near && far.is_finite());
     let centre = [0.5 * width as f64, 0.5 * height as f64];
-    Ok((Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose }, [near, far]))
+    Ok((Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose }, bounds))
 }
 
 /// The names and paths of images, sorted by name. They come from the folder `images` or, if that has none, from the
@@ -170,7 +226,9 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
         }
         [row[15], row[16]] = [near, far];
         // The reader's checks: a written row must be readable.
-        camera(&row).map_err(|what| bad("camera", what))?;
+        if camera(&row).map_err(|what| bad("camera", what))?.1.is_none() {
+            return Err(bad("bounds", format!("must be at least 0 and rise, are {near} and {far}")));
+        }
         values.extend(row);
     }
     write_atomic(folder.join(FILE), &Matrix { rows: views.len(), columns: COLUMNS, values }.write())

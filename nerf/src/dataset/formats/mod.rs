@@ -15,11 +15,13 @@ mod lens;
 mod limits;
 pub mod llff;
 mod locate;
+mod masks;
 mod matrix;
 mod models;
 pub(super) mod npy;
 mod paths;
 mod ply;
+mod points;
 pub mod rigid;
 pub mod transforms;
 

@@ -30,11 +30,12 @@ pub(super) fn file(folder: &Path) -> PathBuf {
 /// Reads `transforms.json`, without decoding images.
 ///
 /// Splits come from `train_filenames`, `val_filenames` and `test_filenames`; an image in both of the latter, as
-/// nerfstudio writes for a single held-out set, is a test image.
+/// nerfstudio writes for a single held-out set, is a test image. Absent and damaged points are left out, which
+/// [`Capture::assumptions`] says.
 ///
 /// # Errors
 /// If the file cannot be read, lacks a field, or has a field that is wrong or unsupported. If a mask or depth file is
-/// absent or damaged, or the points file is damaged.
+/// absent.
 pub fn read(folder: &Path) -> Result<Capture> {
     read_file(folder, &file(folder))
 }
@@ -51,15 +52,14 @@ pub(super) fn read_file(folder: &Path, file: &Path) -> Result<Capture> {
     // nerfstudio scales after the transform.
     let applied = DAffine3 { matrix3: scale * transform.matrix3, translation: scale * transform.translation };
     let aabb_scale = top.positive("aabb_scale")?;
-    let points_file = match top.get("ply_file_path") {
-        Some(path) => Some(folder.join(paths::normal(&top, "ply_file_path", path)?)),
-        None => None,
-    };
-    let points_file = points_file.filter(|file| file.is_file());
-    // The points are in the coordinates of the file: nerfstudio transforms them together with the cameras.
-    let points = points_file.as_deref().map_or(Ok(vec![]), ply::read)?;
     let capture = Capture::new(folder, file.to_owned(), Format::Transforms, views);
-    Ok(Capture { points, points_file, aabb_scale, applied, assumptions, ..capture })
+    let mut capture = Capture { aabb_scale, applied, assumptions, ..capture };
+    if let Some(path) = top.get("ply_file_path") {
+        // The points are in the coordinates of the file: nerfstudio transforms them together with the cameras.
+        let file = folder.join(paths::normal(&top, "ply_file_path", path)?);
+        ply::read(&file).attach(&mut capture, &file);
+    }
+    Ok(capture)
 }
 
 /// The field with the images of a split.

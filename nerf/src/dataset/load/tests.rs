@@ -174,7 +174,7 @@ fn masks_drop_black_and_unlit_pixels() {
     let data = capture.load(Split::Train, &analysis, &LoadOptions::default()).unwrap();
     let used = data.frames[0].mask.as_ref().unwrap();
     assert!(used.used() == 12 * 8 - 1 && !used.uses(4, 1), "one pixel, at half the size");
-    for (size, fits) in [([24, 16], true), ([16, 24], false), ([6, 4], false)] {
+    for (size, fits) in [([24, 16], true), ([6, 4], true), ([5, 3], true), ([16, 24], false), ([6, 6], false)] {
         std::fs::write(
             &path,
             Image { width: size[0], height: size[1], channels: 1, data: vec![1.0; size[0] * size[1]] }.to_png(),
@@ -182,8 +182,18 @@ fn masks_drop_black_and_unlit_pixels() {
         .unwrap();
         let read = capture.load(Split::Train, &analysis, &LoadOptions::default());
         assert_eq!(read.is_ok(), fits, "{size:?}");
-        assert!(read.err().is_none_or(|e| e.to_string().contains("mask.png: has")));
+        let expected = format!("mask.png: has {}x{} pixels but its image 12x8; use one aspect ratio", size[0], size[1]);
+        assert!(read.err().is_none_or(|e| e.to_string().contains(&expected)));
     }
+    // A mask of half the size hides the pixels that its black one covers, and those that it touches.
+    let mut mask = Image { width: 6, height: 4, channels: 1, data: vec![1.0; 24] };
+    mask.pixel_mut(2, 1)[0] = 0.0;
+    std::fs::write(&path, mask.to_png()).unwrap();
+    let data = capture.load(Split::Train, &analysis, &LoadOptions::default()).unwrap();
+    let used = data.frames[0].mask.as_ref().unwrap();
+    let hidden = (0..96).map(|i| [i % 12, i / 12]).filter(|[x, y]| !used.uses(*x, *y)).collect::<Vec<_>>();
+    assert!([[4, 2], [5, 2], [4, 3], [5, 3]].iter().all(|pixel| hidden.contains(pixel)), "{hidden:?}");
+    assert!(hidden.iter().all(|[x, y]| (2..8).contains(x) && (0..6).contains(y)), "{hidden:?}");
     std::fs::write(&path, Image::new(24, 16, 1).to_png()).unwrap();
     let message = capture.load(Split::Train, &analysis, &LoadOptions::default()).unwrap_err().to_string();
     assert!(message.contains("has no usable pixel"), "{message}");
@@ -200,6 +210,58 @@ fn masks_drop_black_and_unlit_pixels() {
     let moved = Camera { pose: DAffine3::from_translation(DVec3::X), ..camera.clone() };
     assert!(Arc::ptr_eq(&mask, &lit.of(&moved).unwrap()), "one for each camera, wherever it stands");
     assert!(lit.of(&Camera { focal: [40.0; 2], ..camera }).is_none());
+}
+
+#[test]
+fn masks_as_alpha_cut_out_the_object() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 4);
+    capture.split_by_default();
+    let path = folder.path().join("mask.png");
+    // White on the left, a grey column, black on the right.
+    let value = |x: usize| [1.0, 0.4, 0.0][usize::from(x >= 6) + usize::from(x >= 7)];
+    let data: Vec<f32> = (0..96).map(|i| value(i % 12)).collect();
+    std::fs::write(&path, Image { width: 12, height: 8, channels: 1, data }.to_png()).unwrap();
+    capture.views.iter_mut().for_each(|view| view.mask = Some(path.clone()));
+    let analysis = capture.analyze_cutout(None).unwrap();
+    assert_eq!((analysis.scene_type, &analysis.reason[..25]), (SceneType::Bounded, "masks cut out an object; "));
+    assert_eq!(capture.analyze_cutout(Some(SceneType::Unbounded)).unwrap().scene_type, SceneType::Unbounded);
+    assert_ne!(capture.analyze_scene(None).unwrap().scene_type, SceneType::Bounded);
+    let options = LoadOptions { mask_as_alpha: true, ..LoadOptions::default() };
+    let data = capture.load(Split::Train, &analysis, &options).unwrap();
+    let frame = &data.frames[0];
+    assert!(data.has_alpha() && frame.mask.is_none());
+    let view = capture.views.iter().find(|view| view.name == frame.name).unwrap();
+    let plain = capture.photo(view).unwrap();
+    for (x, y) in (0..12).flat_map(|x| (0..8).map(move |y| (x, y))) {
+        let [r, g, b, _] = plain.pixel(x, y);
+        assert_eq!(frame.image.pixel(x, y), [r, g, b, value(x)], "{x} {y}");
+    }
+    assert_eq!(capture.cutout(view).unwrap(), frame.image);
+    // Colours of the background do not bleed: the new pixel has those of its white and grey half.
+    let small = capture.load(Split::Train, &analysis, &LoadOptions { downscale: 4, ..options }).unwrap();
+    let pixel = small.frames[0].image.pixel(1, 0);
+    let place = |x: usize, y: usize| plain.pixel(x, y)[0] * value(x);
+    let sum: f32 = (0..4).flat_map(|y| (4..8).map(move |x| (x, y))).map(|(x, y)| place(x, y)).sum();
+    assert!((pixel[3] - 2.4 / 4.0).abs() < 3e-3 && (pixel[0] - sum / (4.0 * 2.4)).abs() < 3e-3, "{pixel:?}");
+    // The mask of the lens stays.
+    let lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
+    let mut wide = capture.clone();
+    for view in &mut wide.views {
+        (view.camera.lens, view.camera.focal, view.camera.centre) = (lens, [2.0; 2], [12.0, 8.0]);
+    }
+    let used = wide.load(Split::Train, &analysis, &options).unwrap().frames[0].mask.clone().unwrap();
+    assert!(!used.uses(0, 0) && used.uses(8, 4), "black in the mask, but seen");
+    // An image without a mask would show the background that others cut out, unless it is transparent itself.
+    let bare = capture.views.iter_mut().find(|view| view.field == "frames[3]").unwrap();
+    (bare.mask, bare.split) = (None, Some(Split::Train));
+    let own = bare.image.clone().unwrap();
+    let message = capture.load(Split::Train, &analysis, &options).unwrap_err().to_string();
+    let expected =
+        "03.png: has no mask to cut out the object, and no transparency: add its mask, or use masks to ignore";
+    assert!(message.contains("frames[3]") && message.contains(expected), "{message}");
+    std::fs::write(own, Image::new(12, 8, 4).to_png()).unwrap();
+    assert!(capture.load(Split::Train, &analysis, &options).is_ok());
 }
 
 #[test]
@@ -360,14 +422,19 @@ fn plan_counts_the_mask_and_the_depths() {
     let [mask, depth] = ["mask.png", "depth.npy"].map(|name| folder.path().join(name));
     std::fs::write(&mask, Image::new(24, 16, 1).to_png()).unwrap();
     view.mask = Some(mask);
+    let resampled = 3 * pixels;
     let masked = 3 * pixels + 4 * 24 * 16;
-    assert_eq!(plan(&view, true), (masked, 4 * pixels));
+    assert_eq!(plan(&view, true), (masked + resampled, 4 * pixels));
+    // As alpha it is applied to the image before downscaling, and no mask is left.
+    let options = LoadOptions { mask_as_alpha: true, downscale: 2, ..LoadOptions::default() };
+    let cut = Plan::new(&capture, &view, options).unwrap();
+    assert_eq!((cut.decoding, cut.loaded()), (masked + resampled + 4 * pixels, 4 * pixels / 4));
     // Depths are the file and twice as much in f64.
     let header = b"\x93NUMPY".to_vec();
     std::fs::write(&depth, [header, vec![0; 1000]].concat()).unwrap();
     view.depth = Some((depth, 1.0));
-    assert_eq!(plan(&view, false), (masked, 4 * pixels));
-    assert_eq!(plan(&view, true), (masked + 3 * 1006, 8 * pixels));
+    assert_eq!(plan(&view, false), (masked + resampled, 4 * pixels));
+    assert_eq!(plan(&view, true), (masked + resampled + 3 * 1006, 8 * pixels));
     assert_eq!(view.decoding_memory(), masked + 3 * 1006);
 }
 

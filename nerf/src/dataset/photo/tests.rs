@@ -45,6 +45,16 @@ fn resizing_to_other_ratios_shares_pixels() {
 }
 
 #[test]
+fn masks_multiply_alpha() {
+    let mask = bytes(2, 1, 3, &[255, 0, 0, 51, 255, 255]);
+    assert_eq!(bytes(2, 1, 3, &[1, 2, 3, 4, 5, 6]).masked(&mask), bytes(2, 1, 4, &[1, 2, 3, 255, 4, 5, 6, 51]));
+    let rgba = bytes(2, 1, 4, &[1, 2, 3, 100, 4, 5, 6, 100]);
+    assert_eq!(rgba.masked(&mask), bytes(2, 1, 4, &[1, 2, 3, 100, 4, 5, 6, 20]));
+    let words = Photo { width: 2, height: 1, channels: 3, values: Values::Words(vec![9; 6]) };
+    assert_eq!(words.masked(&mask).values, Values::Words(vec![9, 9, 9, 65535, 9, 9, 9, 13107]));
+}
+
+#[test]
 #[should_panic(expected = "cannot be downsized to 4x1")]
 fn resizing_does_not_enlarge() {
     bytes(3, 1, 3, &[0; 9]).resized([4, 1]);

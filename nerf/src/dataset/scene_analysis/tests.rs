@@ -243,6 +243,14 @@ fn near_plane_comes_from_points_or_depths() {
     let analysis = SceneAnalysis::new(&forward, None, None).unwrap();
     assert!(analysis.transform.origin.distance(DVec3::new(0.2, 3.0, 0.0)) < 1e-9, "{}", analysis.transform.origin);
     assert!((analysis.near / analysis.transform.scale - 1.0).abs() < 1e-9);
+    // Half of the cameras are enough; the others do not count.
+    forward.views[1].bounds = None;
+    forward.views[3].bounds = None;
+    let half = SceneAnalysis::new(&forward, None, None).unwrap();
+    assert!(half.transform.origin.distance(analysis.transform.origin) < 1e-9 && half.reason == analysis.reason);
+    forward.views[2].bounds = None;
+    let few = SceneAnalysis::new(&forward, None, None).unwrap();
+    assert!(few.reason.ends_with("cameras look the same way"), "{}", few.reason);
 }
 
 #[test]

@@ -2,13 +2,12 @@
 
 use super::super::locate::locate;
 use crate::dataset::capture::Capture;
+use crate::dataset::formats::masks;
 use crate::error::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Names of image folders.
 const IMAGES: [&str; 4] = ["images", "image", "rgb", "input"];
-/// Names of mask folders.
-const MASKS: [&str; 2] = ["masks", "mask"];
 
 /// Sets the existing image and mask of each view. `model` is the folder of the model.
 ///
@@ -16,12 +15,10 @@ const MASKS: [&str; 2] = ["masks", "mask"];
 /// If two files fit the name of an image.
 pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     let root = if model == capture.folder { root(model) } else { capture.folder.clone() };
-    let folders = |names: &[&str]| -> Vec<PathBuf> {
-        names.iter().map(|name| root.join(name)).filter(|folder| folder.is_dir()).collect()
-    };
     // All images come from one folder, since others may hold the same names at another size. Names may also be relative
     // to the folder of the capture.
-    let mut images = folders(&IMAGES);
+    let folders = IMAGES.map(|name| root.join(name));
+    let mut images: Vec<PathBuf> = folders.into_iter().filter(|folder| folder.is_dir()).collect();
     if model.components().any(|part| part.as_os_str() == "distorted") {
         // 3D Gaussian Splatting keeps undistorted images in `images`, and those of this model in `input`.
         images.reverse();
@@ -37,14 +34,8 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
     let found = locate(&folder, &names, &mut capture.assumptions);
     let found = found.map_err(|(i, what)| Error::field(&capture.file, &capture.views[i].field, what))?;
-    let masks = folders(&MASKS);
-    for (view, image) in capture.views.iter_mut().zip(found) {
-        let exists = |path: &PathBuf| path.is_file();
-        view.image = image.map(|image| image.path);
-        // COLMAP's own naming comes first.
-        let names = [PathBuf::from(format!("{}.png", view.name)), Path::new(&view.name).with_extension("png")];
-        view.mask = masks.iter().flat_map(|folder| names.iter().map(move |name| folder.join(name))).find(exists);
-    }
+    capture.views.iter_mut().zip(found).for_each(|(view, image)| view.image = image.map(|image| image.path));
+    masks::attach(capture, &[root]);
     Ok(())
 }
 

@@ -1,6 +1,7 @@
 //! COLMAP's `.bin` files: numbers in a row, little-endian, each list after its length.
 
 use super::super::encodings::decoded;
+use super::super::points::{Points, reason};
 use super::entries::{CameraEntry, ImageEntry, Place};
 use super::models;
 use super::table::Table;
@@ -17,8 +18,6 @@ const TRACK_ELEMENT: usize = 4 + 4;
 const LEAST_CAMERA: usize = 4 + 4 + 8 + 8 + 3 * 8;
 /// The bytes of an image with an empty name and no observation.
 const LEAST_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
-/// The bytes of a point that no image shows.
-const LEAST_POINT: usize = 8 + 3 * 8 + 3 + 8 + 8;
 
 /// The unread part of a file.
 struct Cursor<'a> {
@@ -71,22 +70,6 @@ impl<'a> Cursor<'a> {
         let mut values = [0.0; N];
         for value in &mut values {
             *value = self.f64(place, member)?;
-        }
-        Ok(values)
-    }
-
-    fn number(&mut self, place: Place, member: &str) -> Result<f64> {
-        let value = self.f64(place, member)?;
-        if !value.is_finite() {
-            return Err(place.error(self.file, member, format!("must be a finite number, is {value}")));
-        }
-        Ok(value)
-    }
-
-    fn numbers<const N: usize>(&mut self, place: Place, member: &str) -> Result<[f64; N]> {
-        let mut values = [0.0; N];
-        for value in &mut values {
-            *value = self.number(place, member)?;
         }
         Ok(values)
     }
@@ -156,20 +139,33 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
     Ok(images)
 }
 
-pub(super) fn points(file: &Path, bytes: &[u8]) -> Result<Vec<Point>> {
-    let mut cursor = Cursor { file, rest: bytes };
-    let count = cursor.count("points3D", LEAST_POINT)?;
-    let mut points = Vec::with_capacity(count);
-    for index in 0..count {
+/// Reads the points up to the first that is not whole.
+pub(super) fn points(file: &Path, bytes: &[u8]) -> Points {
+    let Some((head, rest)) = bytes.split_first_chunk() else {
+        return Points::unreadable("ends before the number of points: copy it again");
+    };
+    let (mut cursor, mut points) = (Cursor { file, rest }, Points::of(u64::from_le_bytes(*head)));
+    for index in 0..usize::try_from(points.total).unwrap_or(usize::MAX) {
         let place = Place::Item("points3D", index);
-        cursor.u64(place, "point3D_id")?;
-        let position = DVec3::from_array(cursor.numbers(place, "xyz")?);
-        let color = cursor.array(place, "rgb")?;
-        let error = cursor.number(place, "error")?;
-        let views = cursor.skip_list(place, "track", TRACK_ELEMENT)?;
-        points.push(Point { position, color, error, views: u32::try_from(views).unwrap_or(u32::MAX) });
+        match point(&mut cursor, place) {
+            Ok(point) => _ = points.push(point, || place.name()),
+            Err(error) => {
+                points.end(reason(error));
+                break;
+            }
+        }
     }
-    Ok(points)
+    points
+}
+
+fn point(cursor: &mut Cursor<'_>, place: Place) -> Result<Point> {
+    let mut float = |member: &str| cursor.array(place, member).map(f64::from_le_bytes);
+    float("point3D_id")?;
+    let position = DVec3::new(float("xyz")?, float("xyz")?, float("xyz")?);
+    let color = cursor.array(place, "rgb")?;
+    let error = cursor.array(place, "error").map(f64::from_le_bytes)?;
+    let views = cursor.skip_list(place, "track", TRACK_ELEMENT)?;
+    Ok(Point { position, color, error, views: u32::try_from(views).unwrap_or(u32::MAX) })
 }
 
 pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {

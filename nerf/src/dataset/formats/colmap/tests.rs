@@ -1,5 +1,6 @@
 use super::*;
 use crate::camera::lens::Lens;
+use crate::dataset::capture::Point;
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use std::fs;
 
@@ -162,9 +163,36 @@ fn images_and_masks_are_found() {
     assert_eq!(found(root), [[Some(a), Some(mask_a)], [Some(b), Some(mask_b)]]);
     let mask_a = touch("masks/a.png.png");
     assert_eq!(found(root)[0][1], Some(mask_a), "COLMAP's own name comes first");
+    assert_eq!(read(root).unwrap().assumptions, [""; 0]);
     // Reading the folder of the model finds the same files.
     let from_model = found(&root.join("sparse/0"));
     assert!(from_model.iter().flatten().all(Option::is_some), "{from_model:?}");
+}
+
+#[test]
+fn masks_are_found_in_any_case() {
+    for (mask, is_found) in [
+        ("a.png.png", true),
+        ("A.PNG.png", true),
+        ("a.PNG", true),
+        ("A.png", true),
+        ("a.mask.png", false),
+        ("b.png", false),
+        ("a.png/x", false),
+    ] {
+        let folder = folder(Encoding::Binary, "sparse/0", &binary());
+        for path in ["images/a.png", "images/b/second.png", &format!("masks/{mask}")] {
+            let path = folder.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "").unwrap();
+        }
+        let capture = read(folder.path()).unwrap();
+        let expected = is_found.then(|| folder.path().join("masks").join(mask));
+        assert_eq!((&capture.views[0].mask, &capture.views[1].mask), (&expected, &None), "{mask}");
+        let count = usize::from(is_found);
+        let said = format!("{count} of 2 images have a mask in `masks`; the others use all pixels");
+        assert_eq!(capture.assumptions, [said]);
+    }
 }
 
 /// Reads the fixture with one file replaced and expects an error about that file.
@@ -205,10 +233,6 @@ fn text_errors_name_the_line() {
         (1, " a.png", "", "`line 5`", "name: is empty"),
         (1, "10.5 11.5 1 12.5 13.5 -1 \n", "", "`line 4`", "POINTS2D: must be triples"),
         (1, "13.5 -1 \n", "13.5\n", "`line 4`", "POINTS2D: must be triples"),
-        (2, "2 1 2 255", "2 1 2 256", "`line 2`", "B: must be an integer of 8 bits, is `256`"),
-        (2, "5 9 8", "nan 9 8", "`line 3`", "Z: must be a finite number, is NaN"),
-        (2, "7 -1", "7 -1 5", "`line 3`", "TRACK: must be pairs"),
-        (2, " -1\n", "", "`line 3`", "ERROR: is missing"),
     ];
     for (which, from, to, field, expected) in cases {
         assert_eq!(TEXT[which].matches(from).count(), 1, "{from}");
@@ -218,15 +242,61 @@ fn text_errors_name_the_line() {
     fails(Encoding::Text, 0, b"\xff", "cameras.txt", "CAMERA_ID: must be an integer");
 }
 
+/// The bytes with other ones at a place.
+fn with(bytes: &[u8], at: usize, new: &[u8]) -> Vec<u8> {
+    let mut bytes = bytes.to_vec();
+    bytes[at..at + new.len()].copy_from_slice(new);
+    bytes
+}
+
+#[test]
+fn damaged_points_are_left_out() {
+    let read = |encoding, bytes: &[u8]| {
+        let mut files = if encoding == Encoding::Text { text() } else { binary() };
+        files[2] = bytes.to_vec();
+        let capture = read(folder(encoding, "sparse/0", &files).path()).unwrap();
+        assert!(capture.views.len() == 2 && capture.points_file.is_some() != capture.points.is_empty());
+        let heights: Vec<f64> = capture.points.iter().map(|point| point.position.z).collect();
+        (heights, capture.assumptions)
+    };
+    let text = |from: &str, to: &str, heights: &[f64], expected: &str| {
+        let (found, said) = read(Encoding::Text, TEXT[2].replacen(from, to, 1).as_bytes());
+        assert_eq!((&found[..], &said[..]), (heights, &[format!("left out 1 of 2 points of {expected}")][..]));
+    };
+    let file = "`sparse/0/points3D.txt`";
+    text("2 1 2 255", "2 1 2 256", &[5.0], &format!("{file}: `line 2`: B: must be an integer of 8 bits, is `256`"));
+    text("5 9 8", "nan 9 8", &[2.0], &format!("{file}: `line 3`: Z: must be a finite number, is NaN"));
+    text("7 -1", "7 -1 5", &[2.0], &format!("{file}: `line 3`: TRACK: must be pairs IMAGE_ID POINT2D_IDX"));
+    text(" -1\n", "", &[2.0], &format!("{file}: `line 3`: ERROR: is missing"));
+    let (found, said) = read(Encoding::Text, b"\xff");
+    let expected = format!("left out the points of {file}: `line 1`: POINT3D_ID: must be an integer");
+    assert!(found.is_empty() && said[0].starts_with(&expected), "{said:?}");
+    let [_, _, points] = binary();
+    let binary = |bytes: &[u8], heights: &[f64], expected: &str| {
+        let (found, said) = read(Encoding::Binary, bytes);
+        assert_eq!((&found[..], said.len()), (heights, 1), "{said:?}");
+        let expected = expected.replacen("points of:", "points of `sparse/0/points3D.bin`:", 1);
+        assert_eq!(said[0], format!("left out {expected}"));
+    };
+    let nan = f64::NAN.to_le_bytes();
+    binary(&with(&points, 16, &nan), &[5.0], "1 of 2 points of: points3D[0] has no finite position");
+    let ends = "the file ends here: copy it again";
+    binary(&points[..points.len() - 1], &[2.0], &format!("1 of 2 points of: `points3D[1].track`: {ends}"));
+    binary(&points[..4], &[], "the points of: ends before the number of points: copy it again");
+    for count in [u64::MAX, 1 << 60, 3] {
+        let what = format!("{} of {count} points of: `points3D[2].point3D_id`: {ends}", count - 2);
+        binary(&with(&points, 0, &count.to_le_bytes()), &[2.0, 5.0], &what);
+    }
+    let (found, said) = read(Encoding::Binary, &with(&points, 51, &[200]));
+    assert!(found.is_empty() && said[0].contains("`points3D[0].track`: announces 200 entries"), "{said:?}");
+    // The error of a point is not known.
+    assert_eq!(read(Encoding::Binary, &with(&points, 43, &nan)), (vec![2.0, 5.0], vec![]));
+}
+
 #[test]
 fn binary_errors_name_the_entry() {
     use Encoding::Binary;
-    let [cameras, images, points] = binary();
-    let with = |bytes: &[u8], at: usize, new: &[u8]| {
-        let mut bytes = bytes.to_vec();
-        bytes[at..at + new.len()].copy_from_slice(new);
-        bytes
-    };
+    let [cameras, images, _] = binary();
     // The second camera begins after 8 + 24 + 32 bytes: the count, and the number, model, width, height and parameters
     // of the first.
     let second = 64;
@@ -251,7 +321,7 @@ fn binary_errors_name_the_entry() {
     fails(Binary, 0, &cameras[..5], "`cameras`", "the file ends before their number");
     // Counts that no memory could hold, and one that is just beyond the end.
     for count in [u64::MAX, 1 << 60, 1 << 33, 3] {
-        for (which, bytes, list) in [(0, &cameras, "`cameras`"), (1, &images, "`images`"), (2, &points, "`points3D`")] {
+        for (which, bytes, list) in [(0, &cameras, "`cameras`"), (1, &images, "`images`")] {
             fails(Binary, which, &with(bytes, 0, &count.to_le_bytes()), list, &format!("announces {count} entries"));
         }
     }
@@ -268,9 +338,6 @@ fn binary_errors_name_the_entry() {
     let third = 85 + 8 + 48;
     fails(Binary, 1, &with(&images, third, &[3]), "`images[1].image_id`", "is `3`, as that of images[0] is");
     fails(Binary, 1, &0_u64.to_le_bytes(), "`images`", "is empty");
-    fails(Binary, 2, &with(&points, 16, &f64::NAN.to_le_bytes()), "`points3D[0].xyz`", "finite");
-    fails(Binary, 2, &with(&points, 43, &f64::NAN.to_le_bytes()), "`points3D[0].error`", "finite");
-    fails(Binary, 2, &with(&points, 51, &[200]), "`points3D[0].track`", "announces 200 entries");
     // Bytes after the end are ignored.
     let mut longer = binary();
     longer.iter_mut().for_each(|bytes| bytes.extend([1, 2, 3]));

@@ -2,6 +2,7 @@
 
 use super::super::encodings::decoded;
 use super::super::limits::start;
+use super::super::points::{Points, reason};
 use super::entries::{CameraEntry, ImageEntry, Place};
 use super::models;
 use super::table::Table;
@@ -126,19 +127,31 @@ fn observations(line: &Words<'_>) -> Result<()> {
     Ok(())
 }
 
-pub(super) fn points(file: &Path, bytes: &[u8]) -> Result<Vec<Point>> {
-    let point = |mut line: Words<'_>| {
-        line.integer::<u64>("POINT3D_ID")?;
-        let position = DVec3::from_array([line.number("X")?, line.number("Y")?, line.number("Z")?]);
-        let color = [line.integer("R")?, line.integer("G")?, line.integer("B")?];
-        let error = line.number("ERROR")?;
-        let track = line.rest.split_whitespace().count();
-        if !track.is_multiple_of(2) {
-            return Err(line.error("TRACK", "must be pairs IMAGE_ID POINT2D_IDX"));
+/// Reads the points of all valid lines.
+pub(super) fn points(file: &Path, bytes: &[u8]) -> Points {
+    let text = decoded(bytes);
+    let mut points = Points::default();
+    for line in lines(file, &text).filter(speaks) {
+        let place = line.place;
+        points.total += 1;
+        match point(line) {
+            Ok(point) => _ = points.push(point, || place.name()),
+            Err(error) => points.leave_out(|| reason(error)),
         }
-        Ok(Point { position, color, error, views: u32::try_from(track / 2).unwrap_or(u32::MAX) })
-    };
-    lines(file, &decoded(bytes)).filter(speaks).map(point).collect()
+    }
+    points
+}
+
+fn point(mut line: Words<'_>) -> Result<Point> {
+    line.integer::<u64>("POINT3D_ID")?;
+    let position = DVec3::from_array([line.number("X")?, line.number("Y")?, line.number("Z")?]);
+    let color = [line.integer("R")?, line.integer("G")?, line.integer("B")?];
+    let error = line.number("ERROR")?;
+    let track = line.rest.split_whitespace().count();
+    if !track.is_multiple_of(2) {
+        return Err(line.error("TRACK", "must be pairs IMAGE_ID POINT2D_IDX"));
+    }
+    Ok(Point { position, color, error, views: u32::try_from(track / 2).unwrap_or(u32::MAX) })
 }
 
 pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {

@@ -82,7 +82,6 @@ fn llff_errors_name_the_row() {
         fails_as(&npy(&rows), &format!("`row 1`: {expected}"));
     };
     fails(3, f64::NAN, "column 3 is not a finite number");
-    fails(16, f64::INFINITY, "column 16 is not a finite number");
     fails(
         2,
         -1.0,
@@ -92,12 +91,74 @@ fn llff_errors_name_the_row() {
     fails(4, 0.4, "height must be 1 to");
     fails(9, 1e300, "width must be 1 to");
     fails(14, 0.0, "focal length must be more than 0");
-    fails(15, -1.0, "depths must be at least 0 and rise");
-    fails(16, 2.5, "depths must be at least 0 and rise");
     fails_as(&npy(&ROWS[..1]), "`shape`: has 1 rows, but there are 2 images");
     fails_as(&npy(&[]), "`shape`: has no rows: add one per image");
     fails_as(&Matrix { rows: 2, columns: 15, values: vec![0.0; 30] }.write(), "`shape`: must have 17 columns, has 15");
     fails_as(b"?", "is not a complete npy file: copy it again");
+}
+
+#[test]
+fn invalid_depths_are_ignored() {
+    for (column, value, expected) in [(15, -1.0, "-1 and 9"), (16, 2.5, "2.5 and 2.5"), (16, f64::NAN, "2.5 and NaN")] {
+        let mut rows = ROWS;
+        rows[1][column] = value;
+        let capture = read(folder(&npy(&rows), &IMAGES).path()).unwrap();
+        assert_eq!(capture.views.iter().map(|view| view.bounds).collect::<Vec<_>>(), [Some([1.5, 20.0]), None]);
+        let what = "ignored the depths of 1 of 2 rows, which must be at least 0 and rise: row 1 has";
+        assert_eq!(capture.assumptions, [format!("{what} {expected}")]);
+    }
+    assert_eq!(read(folder(&npy(&ROWS), &IMAGES).path()).unwrap().assumptions, [""; 0]);
+}
+
+#[test]
+fn list_names_the_images_of_the_rows() {
+    let of = |list: &str, images: &[&str]| {
+        let folder = folder(&npy(&ROWS), images);
+        fs::write(folder.path().join(LIST), list).unwrap();
+        read(folder.path()).map(|capture| {
+            let names = capture.views.iter().map(|view| (view.name.clone(), view.image.is_some(), view.camera.height));
+            (names.collect::<Vec<_>>(), capture.assumptions)
+        })
+    };
+    let images = ["images/a.png", "images/b.png", "images/c.png"];
+    let good = |list: &str, images: &[&str], expected: [(&str, bool); 2]| {
+        let (names, said) = of(list, images).unwrap();
+        assert_eq!(names, expected.map(|(name, exists)| (name.to_owned(), exists, 30)));
+        let count = images.len();
+        assert_eq!(said, [format!("took the images of the 2 rows from `view_imgs.txt`, of {count} images")]);
+    };
+    good("a.png\nc.png", &images, [("a.png", true), ("c.png", true)]);
+    good("\u{feff}./images/a.png\r\n\r\n images\\c.png \r\n", &images, [("a.png", true), ("c.png", true)]);
+    let reduced = ["images_4/a.png", "images_4/b.png", "images_4/c.png"];
+    good("A.JPG\nc.png", &reduced, [("a.png", true), ("c.png", true)]);
+    good("b.png\nd.png", &images, [("b.png", true), ("d.png", false)]);
+    good("b.png\nd.png", &images[1..2], [("b.png", true), ("d.png", false)]);
+    let fails = |list: &str, expected: &str| {
+        let message = of(list, &images).unwrap_err().to_string();
+        assert!(message.contains(&format!("{LIST}: {expected}")), "{message}");
+    };
+    fails("a.png", "has 1 names, but poses_bounds.npy has 2 rows: list the image of each row");
+    fails("a.png\na.png", "lists `a.png` twice");
+    // Two readings.
+    fails(
+        "c.png\na.png",
+        "lists `a.png` after `c.png`: rows may follow these lines or, as LLFF writes them, the names;",
+    );
+    let folder = folder(&npy(&ROWS), &images);
+    let message = read(folder.path()).unwrap_err().to_string();
+    assert!(message.contains("has 2 rows, but there are 3 images in ") && message.contains(LIST), "{message}");
+    // Equal numbers need no list.
+    fs::write(folder.path().join(LIST), "?").unwrap();
+    fs::remove_file(folder.path().join("images/c.png")).unwrap();
+    assert_eq!(read(folder.path()).unwrap().views[1].name, "b.png");
+}
+
+#[test]
+fn llff_masks_are_found() {
+    let folder = folder(&npy(&ROWS), &["images/a.png", "images/b.png", "masks/b.png"]);
+    let capture = read(folder.path()).unwrap();
+    assert_eq!((&capture.views[0].mask, &capture.views[1].mask), (&None, &Some(folder.path().join("masks/b.png"))));
+    assert_eq!(capture.assumptions, ["1 of 2 images have a mask in `masks`; the others use all pixels"]);
 }
 
 #[test]
@@ -143,6 +204,8 @@ fn unwritable_llff_captures_are_named() {
         &|capture| capture.views[1].bounds = None,
         "`row 1.bounds`: are missing; LLFF needs the nearest and the farthest depth",
     );
+    let invalid = "`row 1.bounds`: must be at least 0 and rise, are 2 and 1";
+    fails(&|capture| capture.views[1].bounds = Some([2.0, 1.0]), invalid);
     fails(
         &|capture| capture.views[1].name = "a/b.png".into(),
         "`row 1.name`: `a/b.png` must be a plain png or jpg name",
@@ -161,7 +224,7 @@ proptest! {
         match parse(Path::new("x"), &damaged(&npy(&ROWS), &npy(&ROWS[..1]), &damage), images) {
             Ok(capture) => for View { camera, bounds, .. } in &capture.views {
                 prop_assert!(rigid::pose(&camera.pose).is_ok() && camera.focal[0] > 0.0, "{:?}", camera);
-                prop_assert!(bounds.is_some_and(|[near, far]| 0.0 <= near && near < far && far.is_finite()));
+                prop_assert!(bounds.is_none_or(|[near, far]| 0.0 <= near && near < far && far.is_finite()));
             },
             Err(error) => clear(error, FILE),
         }

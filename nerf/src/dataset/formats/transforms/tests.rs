@@ -247,7 +247,10 @@ fn aabb_scale_is_read_other_fields_are_ignored() {
         capture.views.iter().map(|v| &v.camera).collect::<Vec<_>>(),
         good(|_| {}).views.iter().map(|v| &v.camera).collect::<Vec<_>>()
     );
-    assert_eq!(capture.points, []);
+    assert_eq!((capture.points, capture.points_file), (vec![], None));
+    assert_eq!(capture.assumptions, ["left out the points of `absent.ply`: there is no such file"]);
+    // A wrong field is an error, unlike an absent file.
+    fails(|d| d["ply_file_path"] = json!(7), &["`ply_file_path`: must be a string"]);
 }
 
 #[test]
@@ -294,6 +297,7 @@ fn damaged_transforms_files_are_named() {
         std::fs::write(&files[which], &whole[which]).unwrap();
         match result {
             Ok(capture) => is_whole(&capture),
+            Err(error) if which > 0 => panic!("damaged points are left out: {error}"),
             Err(error) => damage::clear(error, folder.path().to_str().unwrap()),
         }
     });

@@ -51,7 +51,7 @@ fn parsed(capture: &Capture, encoding: Encoding) -> Capture {
         Encoding::Binary => binary::encode(&table),
         Encoding::Text => text::encode(&table),
     };
-    parse(folder, encoding, &encoding.files(folder), [&cameras, &images], Some(&points)).unwrap()
+    parse(folder, encoding, &encoding.files(folder), [&cameras, &images], Some(Ok(points))).unwrap()
 }
 
 #[test]
