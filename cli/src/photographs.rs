@@ -3,7 +3,6 @@
 use raygrad::nerf::dataset::{Capture, Split, View};
 use raygrad::nerf::{Camera, Error, Model, Result};
 
-use super::builtin;
 use super::run::Run;
 use super::scene::Scene;
 
@@ -22,7 +21,7 @@ pub struct Photograph {
 ///
 /// Fails if the capture cannot be read, the split has no images, or the training images differ from those of the run.
 pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: Split) -> Result<Vec<Photograph>> {
-    let capture = builtin::capture(run.scene(scene)?, None, None)?;
+    let capture = run.capture(scene)?;
     let views = present(&capture, split)?;
     if views.is_empty() {
         return Err(Error::file(&capture.file, format!("has no {split} images")));
@@ -75,7 +74,7 @@ mod tests {
 
     #[test]
     fn bounds_are_in_scene_units() {
-        let mut capture = builtin::capture(&Scene::Embedded, None, None).unwrap();
+        let mut capture = Scene::Embedded.capture(None).unwrap();
         let mut view = capture.views.remove(0);
         assert_eq!(bounds(&view, 3.0), None);
         view.bounds = Some([2.0, 7.0]);

@@ -7,6 +7,7 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use raygrad::nerf::dataset::{Capture, HoldOut};
 use raygrad::nerf::{Budget, Config, Error, Model, Result, SceneBox, write_atomic};
 use raygrad::nn::TEMPORARY_PREFIX;
 use serde::{Deserialize, Serialize};
@@ -15,7 +16,7 @@ use serde_json::Value;
 use super::cameras::Viewpoint;
 use super::lock::{Lock, State};
 use super::output::{make_folder, parent, remove};
-use super::scene::Scene;
+use super::scene::{Opened, Scene};
 use super::scratch;
 
 /// Default folder of a run. Further runs use `run-2`, `run-3` ...
@@ -51,6 +52,9 @@ pub struct RunConfig {
     pub scene: Scene,
     /// Factor by which the image size was divided. Range: 1 or more.
     pub downscale: usize,
+    /// Test images that the run holds out; null for the choice of the files.
+    #[serde(default)]
+    pub test: Option<HoldOut>,
     /// Whether masks cut out an object: masked pixels are transparent instead of ignored.
     #[serde(default)]
     pub mask_as_alpha: bool,
@@ -212,6 +216,19 @@ impl Run {
             }
             (given, trained) => Ok(given.unwrap_or(trained)),
         }
+    }
+
+    /// Reads the cameras of [`scene`](Self::scene), with the splits of the run.
+    pub fn capture(&self, given: Option<&Scene>) -> Result<Capture> {
+        self.scene(given)?.capture(self.config.test.as_ref())
+    }
+
+    /// Opens [`scene`](Self::scene) with the scene transform, the splits and the masks of the run.
+    pub fn open_scene(&self, given: Option<&Scene>) -> Result<Opened> {
+        let RunConfig { scene_box, config, test, mask_as_alpha, .. } = &self.config;
+        let mut opened = self.scene(given)?.open_for(scene_box, config.unbounded, test.as_ref())?;
+        opened.mask_as_alpha = *mask_as_alpha;
+        Ok(opened)
     }
 
     /// Loads the last saved model.
@@ -421,6 +438,7 @@ mod tests {
                 raygrad: "0.1.0".into(),
                 scene: Scene::Embedded,
                 downscale: 2,
+                test: None,
                 mask_as_alpha: false,
                 scene_box: SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.5, 4.0]),
                 viewpoint,

@@ -4,11 +4,14 @@ use std::ffi::OsString;
 use std::fmt;
 use std::path::PathBuf;
 
-use raygrad::nerf::dataset::{Capture, Dataset, Frame, LoadOptions, SceneAnalysis, SceneType, Split, evenly_spaced};
+use raygrad::nerf::dataset::{
+    Capture, Dataset, Format, Frame, HoldOut, LoadOptions, SceneAnalysis, SceneType, Split, evenly_spaced,
+};
 use raygrad::nerf::{Error, Result, SceneBox};
 use raygrad_scenes::{embedded, landscape, landscape_distances};
 use serde::{Deserialize, Serialize};
 
+use super::builtin;
 use super::output::complain;
 use super::progress::Progress;
 
@@ -53,22 +56,45 @@ impl fmt::Display for Scene {
 
 impl Scene {
     /// Reads the scene's files and analyses the scene. `asked` overrides the scene type; with `mask_as_alpha` masks cut
-    /// out an object.
-    pub fn open(&self, asked: Option<SceneType>, mask_as_alpha: bool) -> Result<Opened> {
-        let Scene::Folder(folder) = self else {
+    /// out an object; `hold_out` replaces the splits of the files.
+    pub fn open(&self, asked: Option<SceneType>, mask_as_alpha: bool, hold_out: Option<&HoldOut>) -> Result<Opened> {
+        if !matches!(self, Scene::Folder(_)) {
             if mask_as_alpha {
                 return Err(Error::setting("mask-as-alpha", "built-in scenes have no masks: leave the flag out"));
             }
+            if hold_out.is_some() {
+                return Err(Error::setting("test", "built-in scenes have their own test images: leave the flag out"));
+            }
             return Ok(Opened::new(self, None, asked));
-        };
-        let capture = Capture::read(folder)?;
+        }
+        let capture = self.capture(hold_out)?;
         let analysis = if mask_as_alpha { capture.analyze_cutout(asked) } else { capture.analyze_scene(asked) }?;
         Ok(Opened { mask_as_alpha, ..Opened::new(self, Some((capture, analysis)), asked) })
     }
 
+    /// Reads the capture of a folder, or builds that of a built-in scene without images. `hold_out` replaces the splits.
+    pub fn capture(&self, hold_out: Option<&HoldOut>) -> Result<Capture> {
+        let mut capture = builtin::capture(self, None, None)?;
+        hold_out.map_or(Ok(()), |chosen| capture.hold_out(chosen))?;
+        Ok(capture)
+    }
+
+    /// The same scene, described by a file in this format.
+    ///
+    /// # Errors
+    /// For a built-in scene, or if the folder has no description in the format.
+    pub fn in_format(&self, format: Format) -> Result<Scene> {
+        match self {
+            Scene::Folder(folder) => Ok(Scene::Folder(Capture::read_format(folder, Some(format))?.file)),
+            _ => Err(Error::setting("format", "built-in scenes have no files: leave the flag out")),
+        }
+    }
+
     /// Like [`open`](Self::open), with the scene transform of a model. `unbounded` is true for an unbounded scene.
-    pub fn open_for(&self, extent: &SceneBox, unbounded: bool) -> Result<Opened> {
-        let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, None)) };
+    pub fn open_for(&self, extent: &SceneBox, unbounded: bool, hold_out: Option<&HoldOut>) -> Result<Opened> {
+        if !matches!(self, Scene::Folder(_)) {
+            return Ok(Opened::new(self, None, None));
+        }
         let SceneBox { transform, bounds, near_far: [near, far], ndc, .. } = *extent;
         let scene_type = match (unbounded, ndc) {
             (false, _) => SceneType::Bounded,
@@ -77,7 +103,7 @@ impl Scene {
         };
         let reason = "as in training".to_owned();
         let analysis = SceneAnalysis { transform, scene_type, bounds, near, far, ndc, reason };
-        Ok(Opened::new(self, Some((Capture::read(folder)?, analysis)), None))
+        Ok(Opened::new(self, Some((self.capture(hold_out)?, analysis)), None))
     }
 
     /// The same scene with an absolute path.
@@ -105,6 +131,11 @@ pub struct Opened {
 impl Opened {
     fn new(scene: &Scene, capture: Option<(Capture, SceneAnalysis)>, asked: Option<SceneType>) -> Self {
         Opened { depth: false, mask_as_alpha: false, scene: scene.clone(), capture, asked }
+    }
+
+    /// The factor that brings images to a size that trains well; 1 for built-in scenes.
+    pub fn automatic_downscale(&self) -> usize {
+        self.capture.as_ref().map_or(1, |(capture, _)| capture.automatic_downscale())
     }
 
     /// Loads at most `views` evenly spaced images of a split at `1 / downscale` of their size. Warns of absent images.
@@ -202,7 +233,7 @@ mod tests {
         std::fs::write(folder.path().join("transforms.json"), transforms.to_string()).unwrap();
         let scene = Scene::Folder(folder.path().to_owned());
         for mask_as_alpha in [false, true] {
-            let opened = scene.open(None, mask_as_alpha).unwrap();
+            let opened = scene.open(None, mask_as_alpha, None).unwrap();
             let data = opened.load(Split::Train, 1, usize::MAX).unwrap();
             assert_eq!(data.scene_type == SceneType::Bounded, mask_as_alpha);
             let frame = &data.frames[0];
@@ -210,7 +241,7 @@ mod tests {
             let [hidden, used] = [[3, 2], [4, 2]].map(|[x, y]| frame.image.pixel(x, y)[3]);
             assert_eq!((hidden, used), (f32::from(u8::from(!mask_as_alpha)), 1.0));
         }
-        let message = Scene::Embedded.open(None, true).err().unwrap().to_string();
+        let message = Scene::Embedded.open(None, true, None).err().unwrap().to_string();
         assert_eq!(message, "`mask-as-alpha`: built-in scenes have no masks: leave the flag out");
     }
 }

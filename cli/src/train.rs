@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use clap::Parser;
 use raygrad::Schedule;
-use raygrad::nerf::dataset::{Dataset, SceneType, Split};
+use raygrad::nerf::dataset::{Dataset, Format, HoldOut, SceneType, Split};
 use raygrad::nerf::model::RefinedParam;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Error, Preset, Result, StepStats, Trainer, available_memory};
@@ -37,13 +37,15 @@ const RETREATS: u32 = 3;
 const FINISHED: &str = ", the end of its budget: add --steps or --budget with a larger total to train on";
 
 /// Options of new runs only.
-const NEW: [&str; 16] = [
+const NEW: [&str; 18] = [
     "scene",
     "preset",
     "skip",
     "carve",
     "seed",
     "downscale",
+    "format",
+    "test",
     "scene_type",
     "background",
     "refine",
@@ -104,11 +106,24 @@ pub struct Args {
     /// Random seed
     #[arg(long, help_heading = "Advanced", value_name = "N", default_value_t = 0)]
     seed: u64,
-    /// Divide the image size by K
+    /// Divide the image size by K [default: automatic]
     ///
-    /// A training pixel is the mean of the image pixels that it covers. Range: 1 to 16384.
-    #[arg(long, help_heading = "Scene", value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
-    downscale: usize,
+    /// A training pixel is the mean of the image pixels that it covers. The default brings the longest side to 1600
+    /// pixels or less; 1 keeps the size. Range: 1 to 16384.
+    #[arg(long, help_heading = "Scene", value_name = "K", value_parser = parse::count(1 << 14))]
+    downscale: Option<usize>,
+    /// Test images: none, every:N, or names
+    ///
+    /// Holds these images out of training, in place of the choice of the capture's files. every:8 holds out every
+    /// eighth by name, which is the default where the files have no splits. Example: --test frame_3.jpg,frame_9.jpg
+    #[arg(long, help_heading = "Scene", value_name = "IMAGES", value_parser = parse::word::<HoldOut>)]
+    test: Option<HoldOut>,
+    /// transforms, blender, colmap or llff
+    ///
+    /// Chooses the files to read if a folder has several descriptions of a capture. By default the one with most
+    /// images counts. The path of a description, such as my-scene/sparse/1/images.bin, chooses it too.
+    #[arg(long, help_heading = "Scene", value_name = "FORMAT", value_parser = parse::word::<Format>)]
+    format: Option<Format>,
     /// bounded, unbounded or forward-facing
     ///
     /// bounded: an object in front of an empty background. unbounded: the images show the surroundings.
@@ -247,9 +262,11 @@ pub fn run(args: &Args) -> Result<Trained> {
 /// Trains a new run.
 fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
-    let mut scene = args.scene.open(args.scene_type, args.mask_as_alpha)?;
+    let source = args.format.map_or_else(|| Ok(args.scene.clone()), |format| args.scene.in_format(format))?;
+    let mut scene = source.open(args.scene_type, args.mask_as_alpha, args.test.as_ref())?;
+    let downscale = args.downscale.unwrap_or_else(|| scene.automatic_downscale());
     scene.depth = args.has_depth_loss();
-    let mut data = scene.load(Split::Train, args.downscale, usize::MAX)?;
+    let mut data = scene.load(Split::Train, downscale, usize::MAX)?;
     if let Some(near) = args.near {
         set_near(&mut data, near)?;
     }
@@ -257,12 +274,18 @@ fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
     let config = args.config(&data)?;
     let background = config.background.shown();
     let trainer = Trainer::new(config, data.clone())?;
-    let (run, lock) = Run::create(folder, args.run_config(&trainer, &data)?)?;
+    let (run, lock) = Run::create(folder, args.run_config(&source, downscale, &trainer, &data)?)?;
     describe(&run, &trainer, &data, &scene)?;
     // Warnings come after all checks, so that an error is the only line of output.
     doctor::warn(&scene);
+    if args.downscale.is_none() && downscale > 1 {
+        let [width, height] = [data.frames[0].image.width, data.frames[0].image.height];
+        complain(&format!(
+            "note: images are downscaled by {downscale}, to {width}x{height}; --downscale 1 keeps their size"
+        ));
+    }
 
-    let preview = Preview::choose(&scene, args.downscale, &data, background);
+    let preview = Preview::choose(&scene, downscale, &data, background);
     train((run, lock), trainer, args.budget(), args, preview, listener)
 }
 
@@ -274,8 +297,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
         (Some(budget), _) | (None, Some(budget)) => budget,
         (None, None) => return Err(Error::setting("budget", "the run has none: add --budget or --steps")),
     };
-    let mut scene = run.scene(None)?.open_for(&extent, config.unbounded)?;
-    scene.mask_as_alpha = run.config.mask_as_alpha;
+    let mut scene = run.open_scene(None)?;
     scene.depth = config.loss_terms.iter().any(|term| term.kind() == "depth");
     let data = scene.load(Split::Train, downscale, usize::MAX)?;
     let [near, far] = extent.near_far;

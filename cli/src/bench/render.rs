@@ -100,9 +100,7 @@ fn trained(scale: &Scale) -> Result<(Model<f32>, Dataset)> {
 
 fn stored(folder: &Path, scale: &Scale) -> Result<(Model<f32>, Dataset)> {
     let run = Run::open(folder)?;
-    let mut scene = run.scene(None)?.open_for(&run.config.scene_box, run.config.config.unbounded)?;
-    scene.mask_as_alpha = run.config.mask_as_alpha;
-    let data = scene.load(Split::Test, run.config.downscale, scale.views)?;
+    let data = run.open_scene(None)?.load(Split::Test, run.config.downscale, scale.views)?;
     if data.frames.is_empty() {
         return Err(Error::file(folder, "its scene has no test images to compare with"));
     }

@@ -142,8 +142,7 @@ pub fn run(args: &Args) -> Result<()> {
         model.set_skip(skip);
     }
     let scene = run.scene(args.scene.as_ref())?;
-    let mut opened = scene.open_for(&run.config.scene_box, run.config.config.unbounded)?;
-    opened.mask_as_alpha = run.config.mask_as_alpha;
+    let opened = run.open_scene(args.scene.as_ref())?;
     let mut data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
     if args.split != Split::Train
         && let Some(frame) = data.frames.iter().find(|frame| run.config.images.contains(&frame.name))

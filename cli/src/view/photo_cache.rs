@@ -10,7 +10,6 @@ use raygrad_scenes::{embedded, landscape};
 use super::cache::{Cache, Cached};
 use super::messages::{AboutPhotograph, rows};
 use super::requests::Requests;
-use crate::builtin;
 use crate::eval::alignment::Appearance;
 use crate::photographs::{check_trained, present};
 use crate::run::Run;
@@ -57,7 +56,7 @@ impl PhotoCache {
     /// Fails if the capture cannot be read or the training images differ from those of the run.
     pub fn open(run: &Run, scene: Option<&Scene>) -> Result<Self> {
         let scene = run.scene(scene)?.clone();
-        let capture = builtin::capture(&scene, None, None)?;
+        let capture = run.capture(Some(&scene))?;
         let width = if scene == Scene::Landscape { LANDSCAPE_SIZE[0] } else { EMBEDDED_SIZE };
         let transform = run.config.scene_box.transform;
         let mut entries = vec![];
@@ -228,7 +227,7 @@ mod tests {
 
     /// Images of these splits at these positions, looking down.
     fn photos(scene: Scene, places: &[(Split, DVec3)]) -> PhotoCache {
-        let capture = builtin::capture(&Scene::Landscape, None, None).unwrap();
+        let capture = Scene::Landscape.capture(None).unwrap();
         let mut numbers = [0; 3];
         let entry = |(split, place): &(Split, DVec3)| {
             let which = Split::ALL.iter().position(|own| own == split).unwrap();

@@ -18,6 +18,7 @@ mod attack;
 mod browser;
 mod captures;
 mod convert;
+mod dialects;
 mod export;
 mod lpips;
 mod outside;

@@ -2,9 +2,11 @@
 
 use super::Split;
 use crate::camera::pinhole::Camera;
+use crate::error::{Error, Result};
 use glam::{DAffine3, DVec3};
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 /// The file format of a capture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,6 +30,21 @@ impl fmt::Display for Format {
             Format::Colmap => "COLMAP",
             Format::Llff => "LLFF",
         })
+    }
+}
+
+impl FromStr for Format {
+    type Err = Error;
+
+    /// Reads `transforms`, `blender`, `colmap` or `llff`.
+    fn from_str(text: &str) -> Result<Self> {
+        match text {
+            "transforms" => Ok(Format::Transforms),
+            "blender" => Ok(Format::Blender),
+            "colmap" => Ok(Format::Colmap),
+            "llff" => Ok(Format::Llff),
+            _ => Err(Error::setting("format", format!("is `{text}`; use transforms, blender, colmap or llff"))),
+        }
     }
 }
 
