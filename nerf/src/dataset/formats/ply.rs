@@ -336,7 +336,7 @@ mod tests {
         points(&mut &bytes[..])
     }
 
-    /// All points, of which none may be left out.
+    /// All points; none may be left out.
     #[track_caller]
     fn whole(bytes: &[u8]) -> Vec<Point> {
         let read = parse(bytes).unwrap();
