@@ -55,7 +55,7 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
         images.into_iter().map(|(name, path)| (name, Some(path))).collect();
     if matrix.rows != count {
         images = listed(folder, matrix.rows, images)?;
-        assumptions.push(format!("took the images of the {} rows from `{LIST}`, of {count} images", matrix.rows));
+        assumptions.push(format!("took the {} images that `{LIST}` lists, of {count}", matrix.rows));
     }
     let (mut views, mut invalid) = (Vec::with_capacity(matrix.rows), vec![]);
     for (index, (row, (name, image))) in matrix.values.chunks_exact(COLUMNS).zip(images).enumerate() {
