@@ -49,8 +49,8 @@ pub(crate) fn detect(folder: &Path) -> bool {
 /// left out, which [`Capture::assumptions`] says.
 ///
 /// # Errors
-/// If a file of cameras or images is absent or damaged, an image has no camera, an identifier or name is duplicated, a camera model is not
-/// supported, or a number is not finite. The error names the file and the entry or line.
+/// If a file of cameras or images is absent or damaged, an image has no camera, an identifier or name is duplicated, a
+/// camera model is not supported, or a number is not finite. The error names the file and the entry or line.
 pub fn read(folder: &Path) -> Result<Capture> {
     let Some((model, encoding)) = find(folder) else {
         let what = "has no COLMAP model: expected cameras.bin and images.bin, or both as .txt, in sparse/0";

@@ -26,7 +26,7 @@ pub(crate) fn detect(folder: &Path) -> bool {
     folder.join(FILE).is_file()
 }
 
-/// Reads the cameras of `folder`. No image is decoded. Invalid depths are left out, which [`Capture::assumptions`] says.
+/// Reads the cameras of `folder`. No image is decoded. Invalid depths are ignored, as [`Capture::assumptions`] says.
 ///
 /// # Errors
 /// If a file is absent or damaged, a number is not valid for a camera, or the numbers of images and cameras differ
@@ -91,8 +91,8 @@ fn listed(
         let beside = images.first().and_then(|(_, path)| path.as_ref()?.parent());
         let beside = beside.map_or("".into(), |folder| format!(" in {}", folder.display()));
         let what = format!(
-            "has {rows} rows, but there are {} images{beside}: give each row its image, in the order of their names, or \
-            list the names of the rows' images in {LIST}",
+            "has {rows} rows, but there are {} images{beside}: give each row its image, in the order of their names, \
+            or list the names of the rows' images in {LIST}",
             images.len()
         );
         return Err(Error::field(folder.join(FILE), "shape", what));

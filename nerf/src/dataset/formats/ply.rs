@@ -392,7 +392,7 @@ mod tests {
         // Elements and lists before and within the vertices are skipped.
         let header = "comment c\nelement camera 2\nproperty double a\nproperty list uchar short b\nelement vertex 1\n\
             property double nx\nproperty char x\nproperty short y\nproperty list int uchar l\nproperty float z\n\
-            property int a\nproperty uint b\nproperty ushort c\nelement face 7\nproperty list uchar int vertex_indices\n\
+            property int a\nproperty uint b\nproperty ushort c\nelement face 7\nproperty list uchar int indices\n\
             property quad q\nend_header";
         let point = Point { position: DVec3::new(-3.0, -300.0, 0.75), color: GREY, error: 0.0, views: 0 };
         for (format, big) in [("little", false), ("big", true)] {
