@@ -105,8 +105,8 @@ fn test_images_can_be_chosen() {
     place.fails("eval all", &["has no test images"]);
     place.succeeds("train --resume all --steps 2");
     assert_eq!(train("--test every:2", "half").len(), 5);
-    place.succeeds("eval half --out half/result");
-    assert_eq!(place.json("half/result/result.json")["views"].as_array().unwrap().len(), 6);
+    place.succeeds("eval half");
+    assert_eq!(place.json("half/eval-test-fast.json")["views"].as_array().unwrap().len(), 6);
     let chosen = train("--test r_3,val/r_1", "named");
     assert!(chosen.len() == 9 && !chosen.contains(&"train/r_3".to_owned()), "{chosen:?}");
     // A path along training images counts those of the run.
@@ -159,8 +159,8 @@ fn large_images_are_downscaled() {
     };
     assert_eq!(train("", "run"), (true, json!(3)));
     assert_eq!(train("--downscale 1", "whole"), (false, json!(1)));
-    place.succeeds("eval run --views 1 --out result");
-    assert_eq!(place.json("result/result.json")["downscale"], json!(3));
+    place.succeeds("eval run");
+    assert_eq!(place.json("run/eval-test-fast.json")["downscale"], json!(3));
     // Renders have the size of training.
     place.succeeds("render run --path test --out views");
     assert_eq!(png(&place.path("views/0000.png")).width, 1068);

@@ -482,11 +482,17 @@ fn used_pixels(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
     Ok(Mask::new(to[0], to[1], |x, y| mask.pixel(x, y)[0] >= WHITE))
 }
 
+/// Returns true if the aspect ratios of a mask and its image agree, up to a pixel of the smaller.
+pub(crate) fn mask_fits(mask: [usize; 2], image: [usize; 2]) -> bool {
+    let longest = mask.into_iter().chain(image).max().unwrap_or(0);
+    (mask[0] * image[1]).abs_diff(mask[1] * image[0]) <= longest
+}
+
 /// Reads a mask (white for used pixels) of an image of the size `of`, resampled to the size `to`.
 fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Photo> {
     let mask = Photo::open(path, Some(of))?;
     let from = [mask.width, mask.height];
-    if (from[0] * of[1]).abs_diff(from[1] * of[0]) > of[0].max(of[1]) {
+    if !mask_fits(from, of) {
         let what =
             format!("has {}x{} pixels but its image {}x{}; use one aspect ratio", from[0], from[1], of[0], of[1]);
         return Err(Error::file(path, what));

@@ -176,6 +176,10 @@ kinds! {
     Leak = "leak", Warning,
         "training sees the content or pose of {} held out",
         "Hold out images from other places: scores on these say nothing about new views.";
+    /// Masks have another aspect ratio than their images.
+    MaskShape = "mask-shape", Error,
+        "the aspect ratio of the mask does not match that of {}: {}",
+        "A mask may have any size, but it must show the whole image. Make these masks again.";
     /// Masks hide whole images.
     MaskHidesAll = "mask-hides-all", Error,
         "the masks of {} hide every pixel",

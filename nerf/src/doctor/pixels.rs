@@ -3,7 +3,7 @@
 use super::kinds::{FindingKind as Kind, Severity};
 use super::look::Look;
 use super::report::Findings;
-use crate::dataset::load::same_shape;
+use crate::dataset::load::{mask_fits, same_shape};
 use crate::dataset::{Capture, Photo, Split, View};
 use crate::error::Result;
 use crate::numbers::{median, spread};
@@ -29,6 +29,7 @@ const AROUND: usize = 1000;
 pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 2], usize)> {
     let mut counts: HashMap<[usize; 2], usize> = HashMap::new();
     let (mut shapes, mut first) = (vec![], String::new());
+    let (mut masks, mut first_mask) = (vec![], String::new());
     for view in capture.present() {
         let Some(Ok([stored, shown])) = view.image.as_ref().map(Photo::size_of_file) else { continue };
         *counts.entry(shown).or_default() += 1;
@@ -39,8 +40,16 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
             }
             shapes.push(view);
         }
+        let Some(Ok([_, mask])) = view.mask.as_ref().map(Photo::size_of_file) else { continue };
+        if !mask_fits(mask, stored) && !mask_fits(mask, shown) {
+            if masks.is_empty() {
+                first_mask = format!("{}x{} pixels, the image has {}x{}", mask[0], mask[1], shown[0], shown[1]);
+            }
+            masks.push(view);
+        }
     }
     findings.about(Kind::ShapeMismatch, shapes, &[&first]);
+    findings.about(Kind::MaskShape, masks, &[&first_mask]);
     let mut counts: Vec<_> = counts.into_iter().collect();
     counts.sort_by_key(|(size, count)| (std::cmp::Reverse(*count), *size));
     if counts.len() > 1 {
@@ -163,9 +172,33 @@ fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
 mod tests {
     use super::*;
     use crate::camera::Camera;
+    use crate::dataset::{Format, Image};
     use glam::{DAffine3, DVec3};
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64Mcg;
+
+    #[test]
+    fn masks_of_another_shape_are_found() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, width: usize, height: usize| {
+            let path = folder.path().join(name);
+            Image::new(width, height, 1).save_png(&path).unwrap();
+            Some(path)
+        };
+        let camera = Camera::from_angle(8, 6, 0.7, DAffine3::IDENTITY);
+        let view = |i: usize| {
+            let [width, height] = [[16, 12], [4, 3], [8, 8], [6, 8]][i];
+            let [image, mask] = [write("a.png", 8, 6), write(&format!("mask{i}.png"), width, height)];
+            View { image, mask, ..View::new(i.to_string(), i.to_string(), camera.clone()) }
+        };
+        let views = (0..4).map(view).collect();
+        let capture = Capture::new(folder.path(), "transforms.json".into(), Format::Transforms, views);
+        let mut findings = Findings::default();
+        assert_eq!(sizes(&capture, &mut findings), [([8, 6], 4)]);
+        let [found] = &findings.sorted()[..] else { panic!("not one finding") };
+        assert_eq!((found.kind, &found.views[..]), (Kind::MaskShape, &["2".to_owned(), "3".to_owned()][..]));
+        assert!(found.what.ends_with("of 2 images: 8x8 pixels, the image has 8x6"), "{}", found.what);
+    }
 
     #[test]
     fn residuals_are_from_the_median_of_the_nearest() {

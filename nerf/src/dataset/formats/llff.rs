@@ -26,7 +26,7 @@ pub(super) fn file(folder: &Path) -> PathBuf {
     folder.join(FILE)
 }
 
-/// Reads the cameras of `folder`. No image is decoded. Invalid depths are left out, which [`Capture::assumptions`] says.
+/// Reads the cameras of `folder`. No image is decoded. Invalid depths are ignored, as [`Capture::assumptions`] says.
 ///
 /// # Errors
 /// If a file is absent or damaged, a number is not valid for a camera, or the numbers of images and cameras differ
@@ -55,7 +55,7 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
         images.into_iter().map(|(name, path)| (name, Some(path))).collect();
     if matrix.rows != count {
         images = listed(folder, matrix.rows, images)?;
-        assumptions.push(format!("took the images of the {} rows from `{LIST}`, of {count} images", matrix.rows));
+        assumptions.push(format!("took the {} images that `{LIST}` lists, of {count}", matrix.rows));
     }
     let (mut views, mut invalid) = (Vec::with_capacity(matrix.rows), vec![]);
     for (index, (row, (name, image))) in matrix.values.chunks_exact(COLUMNS).zip(images).enumerate() {
@@ -91,8 +91,8 @@ fn listed(
         let beside = images.first().and_then(|(_, path)| path.as_ref()?.parent());
         let beside = beside.map_or("".into(), |folder| format!(" in {}", folder.display()));
         let what = format!(
-            "has {rows} rows, but there are {} images{beside}: give each row its image, in the order of their names, or \
-            list the names of the rows' images in {LIST}",
+            "has {rows} rows, but there are {} images{beside}: give each row its image, in the order of their names, \
+            or list the names of the rows' images in {LIST}",
             images.len()
         );
         return Err(Error::field(folder.join(FILE), "shape", what));

@@ -122,7 +122,7 @@ fn line(reader: &mut impl BufRead) -> Result<String> {
     let mut bytes = vec![];
     let read = reader.by_ref().take(LONGEST_LINE).read_until(b'\n', &mut bytes);
     match read.map_err(|e| format!("cannot be read: {e}"))? as u64 {
-        0 => Err("ends within its header, copy it again".to_owned()),
+        0 => Err("ends within its header: copy it again".to_owned()),
         LONGEST_LINE => Err(format!("has a line of {LONGEST_LINE} bytes or more, too long for a PLY file")),
         // Comments may be in any encoding.
         _ => Ok(String::from_utf8_lossy(&bytes).into_owned()),
@@ -336,7 +336,7 @@ mod tests {
         points(&mut &bytes[..])
     }
 
-    /// All points, of which none may be left out.
+    /// All points; none may be left out.
     #[track_caller]
     fn whole(bytes: &[u8]) -> Vec<Point> {
         let read = parse(bytes).unwrap();
@@ -392,7 +392,7 @@ mod tests {
         // Elements and lists before and within the vertices are skipped.
         let header = "comment c\nelement camera 2\nproperty double a\nproperty list uchar short b\nelement vertex 1\n\
             property double nx\nproperty char x\nproperty short y\nproperty list int uchar l\nproperty float z\n\
-            property int a\nproperty uint b\nproperty ushort c\nelement face 7\nproperty list uchar int vertex_indices\n\
+            property int a\nproperty uint b\nproperty ushort c\nelement face 7\nproperty list uchar int indices\n\
             property quad q\nend_header";
         let point = Point { position: DVec3::new(-3.0, -300.0, 0.75), color: GREY, error: 0.0, views: 0 };
         for (format, big) in [("little", false), ("big", true)] {
@@ -496,7 +496,7 @@ mod tests {
         }
         let unknown = TEXT.replace("ascii", "binary_big_endian").replace("float y", "quad y");
         assert_eq!(parse(unknown.as_bytes()).unwrap_err(), "has the property `y` of an unknown type");
-        assert_eq!(parse(&TEXT.as_bytes()[..21]).unwrap_err(), "ends within its header, copy it again");
+        assert_eq!(parse(&TEXT.as_bytes()[..21]).unwrap_err(), "ends within its header: copy it again");
         assert!(parse(&[b"ply\n".to_vec(), vec![b'x'; 5000]].concat()).unwrap_err().contains("4096 bytes"));
         assert!(parse(&[b"ply\n".to_vec(), b"comment\n".repeat(2000)].concat()).unwrap_err().contains("1000 lines"));
         // Entries without properties take no time.

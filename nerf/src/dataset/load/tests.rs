@@ -185,6 +185,9 @@ fn masks_drop_black_and_unlit_pixels() {
         let expected = format!("mask.png: has {}x{} pixels but its image 12x8; use one aspect ratio", size[0], size[1]);
         assert!(read.err().is_none_or(|e| e.to_string().contains(&expected)));
     }
+    // Sides are rounded.
+    assert!(mask_fits([1334, 1000], [333, 250]) && mask_fits([333, 250], [1334, 1000]));
+    assert!(!mask_fits([1334, 1010], [333, 250]) && !mask_fits([333, 252], [1334, 1000]));
     // A mask of half the size hides the pixels that its black one covers, and those that it touches.
     let mut mask = Image { width: 6, height: 4, channels: 1, data: vec![1.0; 24] };
     mask.pixel_mut(2, 1)[0] = 0.0;

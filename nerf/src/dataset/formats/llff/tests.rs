@@ -125,7 +125,7 @@ fn list_names_the_images_of_the_rows() {
         let (names, said) = of(list, images).unwrap();
         assert_eq!(names, expected.map(|(name, exists)| (name.to_owned(), exists, 30)));
         let count = images.len();
-        assert_eq!(said, [format!("took the images of the 2 rows from `view_imgs.txt`, of {count} images")]);
+        assert_eq!(said, [format!("took the 2 images that `view_imgs.txt` lists, of {count}")]);
     };
     good("a.png\nc.png", &images, [("a.png", true), ("c.png", true)]);
     good("\u{feff}./images/a.png\r\n\r\n images\\c.png \r\n", &images, [("a.png", true), ("c.png", true)]);
