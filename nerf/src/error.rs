@@ -48,6 +48,13 @@ impl Error {
     pub fn setting(name: impl ToString, what: impl ToString) -> Self {
         Error::Setting { name: line(name), what: line(what) }
     }
+
+    /// The same error with more advice.
+    pub(crate) fn with(mut self, advice: &str) -> Self {
+        let (Error::File { what, .. } | Error::Field { what, .. } | Error::Setting { what, .. }) = &mut self;
+        *what = line(format!("{what}; {advice}"));
+        self
+    }
 }
 
 /// The most characters of a part of a message: it may repeat a name from a file.

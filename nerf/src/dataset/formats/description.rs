@@ -108,15 +108,10 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>) -> Result<Cap
     let most = captures.iter().map(|(_, capture)| present(capture)).max().unwrap_or(0);
     let best = captures.iter().position(|(_, capture)| present(capture) == most).unwrap_or(0);
     if let Some(damaged) = captures[..=best].iter().position(|(_, capture)| capture.is_err()) {
-        let (description, capture) = captures.swap_remove(damaged);
+        let (_, capture) = captures.swap_remove(damaged);
         let other = captures.iter().find(|(_, capture)| present(capture) > 0).map(|(other, _)| *other);
-        return capture.map_err(|error| match other {
-            Some(other) => {
-                let what = format!("{error}; to use `{}` instead, name {}", other.name(), other.file.display());
-                Error::file(path.join(description.name()), what)
-            }
-            None => error,
-        });
+        let advice = other.map(|other| format!("to use `{}` instead, name {}", other.name(), other.file.display()));
+        return capture.map_err(|error| advice.map_or(error, |advice| error.with(&advice)));
     }
     let count = |(description, capture): &(&Description, Result<Capture>)| match capture {
         Ok(capture) => format!("`{}` {} of {}", description.name(), capture.present().count(), capture.views.len()),
