@@ -48,6 +48,7 @@ fn capture(folder: &Path) -> Capture {
             matrix3: DMat3::from_rotation_z(0.4) * (1.0 / 3.0),
             translation: DVec3::new(0.1, 0.2, 0.7),
         },
+        assumptions: vec![],
     }
 }
 
