@@ -8,6 +8,8 @@ use raygrad::nerf::glam::DVec3;
 const FEWEST: usize = 20;
 /// The fraction of points that are cut as outliers at either end, as in LLFF.
 const WRONG: f64 = 0.001;
+/// The least near depth that the scene box gives, as a share of the far depth.
+const LEAST: f64 = 0.01;
 
 /// The depths of each view: from the file, else from its points, else from the scene box. Also returns the number of
 /// views that use the box.
@@ -24,7 +26,8 @@ pub fn of(capture: &Capture) -> Result<(Vec<[f64; 2]>, usize)> {
     let near = analysis.near / transform.scale;
     let guess = |view: &View| {
         let far = view.camera.pose.translation.distance(middle) + reach;
-        [near.min(0.5 * far), far]
+        // Programs divide by the near depth, which is 0 for a camera in the box.
+        [near.clamp(LEAST * far, 0.5 * far), far]
     };
     let all = found.iter().zip(&capture.views).map(|(bounds, view)| bounds.unwrap_or_else(|| guess(view)));
     Ok((all.collect(), guessed))
