@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use raygrad::nerf::dataset::{Capture, Frame, Photo, Point, Split, View};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Camera, Error, Model, Result};
+use raygrad::nerf::{Camera, Error, Lens, Model, Result};
 use raygrad_scenes::{embedded, landscape};
 
 use super::cache::{Cache, Cached};
@@ -117,11 +117,12 @@ impl PhotoCache {
         })
     }
 
-    /// Returns true if evaluation treats an image differently: with a mask, or with the image's own appearance
-    /// embedding.
+    /// Returns true if evaluation treats an image differently: with a mask, weights of a panorama, or the image's own
+    /// appearance embedding.
     pub fn is_special(&self, number: usize, model: &Model<f32>) -> bool {
         let own = |entry: &Entry| Appearance::of(model, entry.split, false) == Appearance::Own;
-        self.entries.get(number).is_some_and(|entry| entry.view.mask.is_some() || own(entry))
+        let is_weighted = |entry: &Entry| entry.view.mask.is_some() || entry.given.lens == Lens::Equirectangular;
+        self.entries.get(number).is_some_and(|entry| is_weighted(entry) || own(entry))
     }
 
     /// The image whose camera is nearest in position and direction.
@@ -297,6 +298,9 @@ mod tests {
         assert!(!photos.is_special(0, &model) && !photos.is_special(7, &model));
         photos.entries[0].view.mask = Some(PathBuf::from("mask.png"));
         assert!(photos.is_special(0, &model) && !photos.is_special(1, &model));
+        photos.entries[0].view.mask = None;
+        photos.entries[0].given.lens = Lens::Equirectangular;
+        assert!(photos.is_special(0, &model));
         // The size of training.
         let at = |photos: &PhotoCache, size: [usize; 2]| photos.is_evaluated_at(1, size);
         assert_eq!([[40, 30], [20, 15], [39, 30], [40, 29]].map(|size| at(&photos, size)), [true, false, false, false]);
