@@ -159,6 +159,8 @@ mod tests {
                 data.frames[1].mask = Some(Arc::new(Mask::new(4, 8, |_, y| y != 6)));
                 data.frames[2].mask = Some(Arc::new(Mask::new(8, 4, |x, _| x != 7)));
             }
+            // For less than 2^32 pixels their numbers would choose the same images.
+            assert!(Pixels::new(&data).is_even);
             let (batch, rng) = (drawn(&data, 500), &mut StdRng::seed_from_u64(3));
             for (number, pixel) in batch.frames.iter().zip(&batch.pixels) {
                 let expected = rng.random_range(0..3);
