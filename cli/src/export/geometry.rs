@@ -312,7 +312,9 @@ mod tests {
         let bounded = Model::new(config.clone(), extent, 0).unwrap();
         assert_eq!(said(&bounded, 9.6, 10.4), Ok(None));
         let note = format!("--bounds reaches beyond the scene box, which ends at {within}");
-        assert_eq!(said(&bounded, 9.6, 10.6), Ok(Some(note)));
+        for (low, high) in [(9.6, 10.6), (9.4, 10.4)] {
+            assert_eq!(said(&bounded, low, high), Ok(Some(note.clone())));
+        }
         let refused = format!("`bounds`: is outside of the scene box; choose a box within {within}");
         assert_eq!(said(&bounded, 10.6, 10.7), Err(refused));
         // Without a grid an unbounded model represents all of space, or the frustum of forward-facing images.
