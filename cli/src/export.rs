@@ -28,8 +28,8 @@ use super::scratch::ScratchFolder;
 /// Everything is in the coordinates of the capture. If the run refined poses, training images get the refined ones,
 /// aligned as a whole to the given ones. Other images keep their poses and get the refined focal length and lens.
 ///
-/// A mesh or point cloud has normals and colours. Of an unbounded scene it covers the scene box. A page (.html)
-/// renders the whole scene in any browser with WebGL 2, without a server or a network.
+/// A mesh or point cloud has normals and colours. It covers the scene box, or --bounds. A page (.html) renders the
+/// whole scene in any browser with WebGL 2, without a server or a network.
 ///
 /// The same command replaces its own files, and no others unless --overwrite is given.
 ///

@@ -8,6 +8,7 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use raygrad::nerf::Error;
+use raygrad::nerf::glam::DVec3;
 use serde_json::Value;
 
 /// Parses an integer from 1 to `most`.
@@ -97,6 +98,25 @@ pub fn color(text: &str) -> Result<[f32; 3], String> {
     let values = text.split(',').map(|value| Some(f32::from(value.trim().parse::<u8>().ok()?) / 255.0));
     let values: Vec<f32> = values.collect::<Option<_>>().ok_or_else(usage)?;
     values.try_into().map_err(|_| usage())
+}
+
+/// Parses the lower and the upper corner of a box: `X0,Y0,Z0,X1,Y1,Z1`.
+pub fn corners(text: &str) -> Result<[DVec3; 2], String> {
+    let usage =
+        |what: String| format!("{what}; write X0,Y0,Z0,X1,Y1,Z1 such as -1,-1,0,1,1,2: lower, then upper corner");
+    let number = |word: &str| {
+        let number = word.trim().parse().ok().filter(|x: &f64| x.is_finite());
+        number.ok_or_else(|| usage(format!("`{word}` is not a finite number")))
+    };
+    let numbers: Vec<f64> = text.split(',').map(number).collect::<Result<_, _>>()?;
+    let [low, high] = match <[f64; 6]>::try_from(numbers) {
+        Ok([x0, y0, z0, x1, y1, z1]) => [DVec3::new(x0, y0, z0), DVec3::new(x1, y1, z1)],
+        Err(numbers) => return Err(usage(format!("a box needs 6 numbers, not {}", numbers.len()))),
+    };
+    match (0..3).find(|axis| low[*axis] >= high[*axis]) {
+        Some(axis) => Err(usage(format!("along {}, {} is not below {}", ["x", "y", "z"][axis], low[axis], high[axis]))),
+        None => Ok([low, high]),
+    }
 }
 
 /// Parses a finite number above 0.
@@ -219,6 +239,25 @@ mod tests {
         assert_eq!(size("400x300"), Ok([400, 300]));
         for bad in ["", "x", "400", "0x0", "400x0", "-1x5", "4x3x2", "16385x1", "99999999999999999999x1"] {
             assert!(size(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn corners_parse_or_say_what_is_wrong() {
+        let expected = [DVec3::new(-1.0, 0.5, 2e3), DVec3::new(0.0, 1.0, 3e3)];
+        assert_eq!(corners("-1,.5,2e3, 0,1,3e3"), Ok(expected));
+        for (bad, what) in [
+            ("", "`` is not a finite number"),
+            ("1,2,3,4,5,x", "`x` is not a finite number"),
+            ("1,2,3,4,5,inf", "`inf` is not a finite number"),
+            ("NaN,2,3,4,5,6", "`NaN` is not a finite number"),
+            ("1,2,3,4,5", "a box needs 6 numbers, not 5"),
+            ("1,2,3,4,5,6,7", "a box needs 6 numbers, not 7"),
+            ("0,0,0,1,1,0", "along z, 0 is not below 0"),
+            ("0,2,0,1,1,1", "along y, 2 is not below 1"),
+        ] {
+            let said = corners(bad).unwrap_err();
+            assert!(said.starts_with(what) && said.contains("write X0,Y0,Z0,X1,Y1,Z1"), "{bad}: {said}");
         }
     }
 

@@ -286,7 +286,7 @@ impl<'a> Watch<'a> {
         let path = folder.join(format!("{:06}.png", stats.step));
         let (image, psnr) = self.preview.show(&trainer.model);
         let png = image.to_png();
-        let (name, held_out) = (self.preview.name.clone(), self.preview.is_held_out());
+        let (name, held_out) = (self.preview.name().to_owned(), self.preview.is_held_out());
         self.keep()?;
         self.account.preview(Previewed { name, held_out, step: stats.step, psnr: psnr.is_finite().then_some(psnr) });
         self.tell(|events| {
@@ -295,7 +295,7 @@ impl<'a> Watch<'a> {
         });
         make_folder(&folder)?;
         write_atomic(&path, &png)?;
-        let (time, name) = (spoken(stats.train_seconds), &self.preview.name);
+        let (time, name) = (spoken(stats.train_seconds), self.preview.name());
         let size = format!("{}x{}", image.width / 2, image.height);
         self.progress.note(&format!("after {time}: {} ({size}), PSNR {psnr:.2} dB on {name}", path.display()));
         Ok(())

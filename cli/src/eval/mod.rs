@@ -12,7 +12,7 @@ use std::time::Instant;
 use raygrad::nerf::dataset::{Capture, Dataset, Frame, Split};
 use raygrad::nerf::imaging::colormap;
 use raygrad::nerf::imaging::lpips::{Backbone, Lpips};
-use raygrad::nerf::imaging::metrics::{SSIM_WINDOW, psnr, ssim};
+use raygrad::nerf::imaging::metrics::{SSIM_WINDOW, psnr_from_mse, ssim, weighted_mse};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
 use raygrad::nerf::{
     Background, Error, Evaluations, Image, Render, Result, available_memory, fitted_cameras, rename_durable,
@@ -404,10 +404,11 @@ fn scale(image: &mut Image, gains: [f32; 3]) {
 
 /// Scores the used pixels from column `half` on. SSIM and LPIPS need an image without a mask.
 fn score(frame: &Frame, render: &Image, truth: &Image, half: usize, lpips: Option<&Lpips>) -> Score {
-    let [seen, shown] = [render, truth].map(|image| used(frame, image, half..image.width));
-    let psnr = psnr(&seen, &shown);
+    let weight = |x: usize, y: usize| if x < half { 0.0 } else { frame.weight(x, y) };
+    let psnr = psnr_from_mse(weighted_mse(render, truth, weight));
     let [width, height] = [truth.width - half, truth.height];
-    let whole = frame.mask.is_none().then(|| [seen, shown].map(|image| Image { width, height, ..image }));
+    let compared = |image: &Image| Image { width, height, ..used(frame, image, half..image.width) };
+    let whole = frame.mask.is_none().then(|| [render, truth].map(compared));
     let windows = width >= SSIM_WINDOW && height >= SSIM_WINDOW;
     Score {
         name: frame.name.clone(),
@@ -421,6 +422,7 @@ fn score(frame: &Frame, render: &Image, truth: &Image, half: usize, lpips: Optio
 mod tests {
     use super::*;
     use raygrad::nerf::dataset::Mask;
+    use raygrad::nerf::{Camera, Lens};
     use raygrad_scenes::embedded;
     use std::sync::Arc;
 
@@ -452,6 +454,25 @@ mod tests {
         assert!(masked.psnr > 100.0 && masked.ssim.is_none(), "{}", masked.psnr);
         assert!(gains(&frame, &render, &truth, 13).iter().all(|gain| (gain - 1.0).abs() < 1e-5));
         assert_eq!(gains(&frame, &Image::new(26, 26, 3), &truth, 13), [1.0; 3]);
+    }
+
+    #[test]
+    fn psnr_of_panorama_weights_rows_by_solid_angle() {
+        // WS-PSNR by its definition (Sun, Lu and Yu 2017).
+        let [width, height] = [64, 32];
+        let mut frame = embedded(Split::Test, 26).frames.remove(0);
+        let truth = Image { data: vec![0.5; width * height * 3], ..Image::new(width, height, 3) };
+        let focal = [height as f64 / std::f64::consts::PI; 2];
+        let camera = Camera::from_angle(width, height, 1.0, frame.camera.pose);
+        frame.camera = Camera { lens: Lens::Equirectangular, focal, ..camera };
+        let error = |row: usize| if row < 4 { 0.25_f64 } else { 0.01 };
+        let mut render = truth.clone();
+        (0..width * height).for_each(|i| render.pixel_mut(i % width, i / width).fill(0.5 + error(i / width) as f32));
+        let weight = |row: usize| ((row as f64 + 0.5 - 16.0) * std::f64::consts::PI / 32.0).cos();
+        let squares: f64 = (0..height).map(|row| weight(row) * error(row).powi(2)).sum();
+        let expected = -10.0 * (squares / (0..height).map(weight).sum::<f64>()).log10();
+        let found = score(&frame, &render, &truth, 0, None).psnr;
+        assert!((found - expected).abs() < 1e-4, "{found} {expected}");
     }
 
     #[test]

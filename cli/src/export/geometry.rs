@@ -6,7 +6,8 @@ use std::time::Instant;
 
 use raygrad::nerf::dataset::{Split, evenly_spaced};
 use raygrad::nerf::geometry::files;
-use raygrad::nerf::geometry::{Stage, SurfaceConfig};
+use raygrad::nerf::geometry::{OrientedBox, Stage, SurfaceConfig};
+use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Error, Model, Result, SceneBox};
 use serde::Serialize;
 
@@ -42,6 +43,12 @@ pub struct GeometryOptions {
         value_parser = parse::count(MOST_POINTS)
     )]
     points: Option<usize>,
+    /// Box of the mesh or points
+    ///
+    /// X0,Y0,Z0,X1,Y1,Z1: the lower and the upper corner in capture units, along the axes of the capture. raygrad
+    /// prints the box of each export in this form. [default: the scene box]
+    #[arg(long, help_heading = "Mesh", value_name = "BOX", value_parser = parse::corners, allow_hyphen_values = true)]
+    bounds: Option<[DVec3; 2]>,
     /// Decimate the mesh to N triangles
     #[arg(long, help_heading = "Mesh", value_name = "N", conflicts_with = "points")]
     triangles: Option<usize>,
@@ -73,10 +80,11 @@ pub struct GeometryOptions {
 }
 
 impl GeometryOptions {
-    /// The configuration of a mesh.
-    fn surface_config(&self) -> SurfaceConfig {
+    /// The configuration of a mesh in this box.
+    fn surface_config(&self, region: Option<OrientedBox>) -> SurfaceConfig {
         let default = SurfaceConfig::default();
         SurfaceConfig {
+            region,
             resolution: self.resolution,
             iso_value: self.iso_value,
             min_component: self.min_component.unwrap_or(default.min_component),
@@ -90,6 +98,7 @@ impl GeometryOptions {
     pub fn check_absent(&self) -> Result<()> {
         let given = [
             ("points", self.points.is_some()),
+            ("bounds", self.bounds.is_some()),
             ("triangles", self.triangles.is_some()),
             ("resolution", self.resolution.is_some()),
             ("iso-value", self.iso_value.is_some()),
@@ -110,13 +119,17 @@ impl GeometryOptions {
 pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Path, job: &Job) -> Result<()> {
     check_writable(parent(out))?;
     let model = run.model()?;
+    let region = options.bounds.map(|corners| OrientedBox::in_capture(&model.scene_box.transform, corners));
+    if let Some(line) = region.as_ref().map(|region| beyond(&model, region)).transpose()?.flatten() {
+        note(&line);
+    }
     let cameras = cameras(run, &model, scene)?;
     let start = Instant::now();
     let mut display = Display::new();
     let mut show = |stage: Stage, done: f64| display.set(stage, done);
     let (shape, said) = match options.points {
         Some(count) => {
-            let cloud = model.point_cloud(&cameras, count, &mut show)?;
+            let cloud = model.point_cloud(&cameras, count, region, &mut show)?;
             let points = cloud.colored_mesh.mesh.positions.len();
             (
                 cloud.colored_mesh,
@@ -124,7 +137,7 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Pa
             )
         }
         None => {
-            let surface = model.surface(&cameras, &options.surface_config(), &mut show)?;
+            let surface = model.surface(&cameras, &options.surface_config(region), &mut show)?;
             let mesh = &surface.colored_mesh.mesh;
             if let Some(most) = options.triangles.filter(|most| mesh.triangles.len() > *most) {
                 let count = mesh.triangles.len();
@@ -147,10 +160,43 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Pa
     };
     drop(display);
     job.check(out)?;
-    let bytes = files::write_with_comment(&shape.into_capture(&model.scene_box.transform), out, job.mark())?;
-    let part = if model.config.unbounded { ", cropped to the scene box" } else { "" };
+    let shape = shape.into_capture(&model.scene_box.transform);
+    let bytes = files::write_with_comment(&shape, out, job.mark())?;
+    let part = if model.config.unbounded && region.is_none() { ", cropped to the scene box" } else { "" };
+    let within = shape.mesh.bounds().map_or(String::new(), |corners| format!("; bounds {}", written(corners)));
     let (size, seconds) = (bytes as f64 / 1e6, start.elapsed().as_secs_f64());
-    print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
+    print(&format!("exported {said}{part}{within}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
+}
+
+/// A box in the form of `--bounds`, to a ten-thousandth of its size.
+fn written([low, high]: [DVec3; 2]) -> String {
+    let digits = (4.0 - (high - low).max_element().log10()).clamp(0.0, 12.0) as usize;
+    let numbers = [low, high].into_iter().flat_map(|corner| corner.to_array());
+    numbers.map(|x| format!("{x:.digits$}")).collect::<Vec<_>>().join(",")
+}
+
+/// A note on a box that reaches beyond what the model represents.
+///
+/// # Errors
+/// If all of the box is beyond it.
+fn beyond(model: &Model<f32>, region: &OrientedBox) -> Result<Option<String>> {
+    let transform = model.scene_box.transform;
+    let around =
+        |corners: [DVec3; 8]| corners.iter().fold([corners[0]; 2], |[low, high], &x| [low.min(x), high.max(x)]);
+    let ([low, high], [least, most]) = (model.reach(), around(region.corners()));
+    // The box of the model, along the axes of the capture.
+    let known = || written(around(OrientedBox::from([low, high]).corners().map(|corner| transform.point_back(corner))));
+    let kind = if model.config.unbounded { "what the model represents" } else { "the scene box" };
+    if !(least.cmplt(high).all() && most.cmpgt(low).all()) {
+        return Err(Error::setting("bounds", format!("is outside of {kind}; choose a box within {}", known())));
+    }
+    if least.cmplt(low).any() || most.cmpgt(high).any() {
+        return Ok(Some(format!("--bounds reaches beyond {kind}, which ends at {}", known())));
+    }
+    let ndc = model.scene_box.ndc.filter(|_| model.config.unbounded);
+    let is_seen = ndc.is_none_or(|ndc| region.corners().iter().all(|corner| ndc.contains(*corner)));
+    Ok((!is_seen)
+        .then(|| "--bounds reaches beyond the views of the images, where the model has learned nothing".to_owned()))
 }
 
 /// Rings of cameras around the scene, and the training cameras. Their absence is an error only if `scene` is given.
@@ -214,7 +260,9 @@ impl Display {
 mod tests {
     use super::*;
     use clap::Parser;
-    use raygrad::nerf::glam::DVec3;
+    use raygrad::nerf::dataset::SceneTransform;
+    use raygrad::nerf::glam::DMat3;
+    use raygrad::nerf::{Config, Ndc, Preset};
     use std::f64::consts::PI;
 
     #[test]
@@ -224,9 +272,11 @@ mod tests {
             #[command(flatten)]
             options: GeometryOptions,
         }
-        let config =
-            |flags: &str| Flags::parse_from(format!("export {flags}").split_whitespace()).options.surface_config();
+        let options = |flags: &str| Flags::parse_from(format!("export {flags}").split_whitespace()).options;
+        let config = |flags: &str| options(flags).surface_config(None);
+        assert_eq!(options("--bounds -1,-2,-3,1,2,3").bounds, Some([-1.0, 1.0].map(|x| x * DVec3::new(1.0, 2.0, 3.0))));
         let default = SurfaceConfig {
+            region: None,
             resolution: None,
             iso_value: None,
             min_component: 0.01,
@@ -246,6 +296,36 @@ mod tests {
         ] {
             assert_eq!(config(flags), expected, "{flags}");
         }
+    }
+
+    #[test]
+    fn bounds_beyond_the_model_are_noted_or_refused() {
+        // In the capture, the scene box is from 9.5 to 10.5 along x.
+        let transform = SceneTransform { scale: 2.0, origin: 10.0 * DVec3::X, ..SceneTransform::default() };
+        let extent = SceneBox { transform, ..SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.1, 9.0]) };
+        let said = |model: &Model<f32>, low: f64, high: f64| {
+            let corners = [DVec3::new(low, -0.4, -0.4), DVec3::new(high, 0.4, 0.4)];
+            beyond(model, &OrientedBox::in_capture(&transform, corners)).map_err(|error| error.to_string())
+        };
+        let within = "9.5000,-0.5000,-0.5000,10.5000,0.5000,0.5000";
+        let mut config = Config::preset(Preset::Small);
+        let bounded = Model::new(config.clone(), extent, 0).unwrap();
+        assert_eq!(said(&bounded, 9.6, 10.4), Ok(None));
+        let note = format!("--bounds reaches beyond the scene box, which ends at {within}");
+        for (low, high) in [(9.6, 10.6), (9.4, 10.4)] {
+            assert_eq!(said(&bounded, low, high), Ok(Some(note.clone())));
+        }
+        let refused = format!("`bounds`: is outside of the scene box; choose a box within {within}");
+        assert_eq!(said(&bounded, 10.6, 10.7), Err(refused));
+        // Without a grid an unbounded model represents all of space, or the frustum of forward-facing images.
+        config.unbounded = true;
+        let open = Model::new(config.clone(), extent, 0).unwrap();
+        assert_eq!(said(&open, -90.0, 90.0), Ok(None));
+        let axes = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
+        let ndc = Some(Ndc { eye: 2.0 * DVec3::X, axes, slopes: [0.9; 2], near: 0.2 });
+        let ahead = Model::new(config, SceneBox { ndc, ..extent }, 0).unwrap();
+        assert_eq!(said(&ahead, 9.5, 10.4), Ok(None));
+        assert!(said(&ahead, 9.5, 10.6).unwrap().unwrap().contains("beyond the views of the images"));
     }
 
     #[test]

@@ -8,6 +8,8 @@ use raygrad::nerf::glam::DVec3;
 const FEWEST: usize = 20;
 /// The fraction of points that are cut as outliers at either end, as in LLFF.
 const WRONG: f64 = 0.001;
+/// The least near depth that the scene box gives, as a share of the far depth.
+const LEAST: f64 = 0.01;
 
 /// The depths of each view: from the file, else from its points, else from the scene box. Also returns the number of
 /// views that use the box.
@@ -24,10 +26,16 @@ pub fn of(capture: &Capture) -> Result<(Vec<[f64; 2]>, usize)> {
     let near = analysis.near / transform.scale;
     let guess = |view: &View| {
         let far = view.camera.pose.translation.distance(middle) + reach;
-        [near.min(0.5 * far), far]
+        in_box(near, far)
     };
     let all = found.iter().zip(&capture.views).map(|(bounds, view)| bounds.unwrap_or_else(|| guess(view)));
     Ok((all.collect(), guessed))
+}
+
+/// The depths of a box that begins at `near` for one camera, and ends at `far` for this one.
+fn in_box(near: f64, far: f64) -> [f64; 2] {
+    // Programs divide by the near depth, and the box begins at 0 for a camera inside.
+    [near.clamp(LEAST * far, 0.5 * far), far]
 }
 
 /// The near and far depth of the points that an image shows.
@@ -48,4 +56,14 @@ fn shown(view: &View, points: &[Point]) -> Option<[f64; 2]> {
     let at = |share: f64| depths[(share * last as f64).round() as usize];
     let [near, far] = [at(WRONG), at(1.0 - WRONG)];
     (near < far).then_some([near, far])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn near_depth_is_above_zero_and_before_far() {
+        assert_eq!([0.0, 3.0, 9.0].map(|near| in_box(near, 10.0)), [[0.1, 10.0], [3.0, 10.0], [5.0, 10.0]]);
+    }
 }

@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use raygrad::nerf::dataset::{Capture, Frame, Photo, Point, Split, View};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Camera, Error, Model, Result};
+use raygrad::nerf::{Camera, Error, Lens, Model, Result};
 use raygrad_scenes::{embedded, landscape};
 
 use super::cache::{Cache, Cached};
@@ -118,12 +118,13 @@ impl PhotoCache {
         })
     }
 
-    /// Returns true if evaluation treats an image differently: with a mask, or with the image's own appearance
-    /// embedding.
+    /// Returns true if evaluation treats an image differently: with a mask, weights of a panorama, or the image's own
+    /// appearance embedding.
     pub fn is_special(&self, number: usize, model: &Model<f32>) -> bool {
         let own = |entry: &Entry| Appearance::of(model, entry.split, false) == Appearance::Own;
         let is_masked = |entry: &Entry| entry.view.mask.is_some() && !self.mask_as_alpha;
-        self.entries.get(number).is_some_and(|entry| is_masked(entry) || own(entry))
+        let is_weighted = |entry: &Entry| is_masked(entry) || entry.given.lens == Lens::Equirectangular;
+        self.entries.get(number).is_some_and(|entry| is_weighted(entry) || own(entry))
     }
 
     /// The image whose camera is nearest in position and direction.
@@ -313,6 +314,9 @@ mod tests {
         photos.mask_as_alpha = true;
         assert!(!photos.is_special(0, &model), "the page shows the same alpha");
         photos.mask_as_alpha = false;
+        photos.entries[0].view.mask = None;
+        photos.entries[0].given.lens = Lens::Equirectangular;
+        assert!(photos.is_special(0, &model));
         // The size of training.
         let at = |photos: &PhotoCache, size: [usize; 2]| photos.is_evaluated_at(1, size);
         assert_eq!([[40, 30], [20, 15], [39, 30], [40, 29]].map(|size| at(&photos, size)), [true, false, false, false]);

@@ -135,7 +135,8 @@ fn formats_can_be_chosen() {
     place.succeeds("eval asked --views 1");
     place.fails("train both --format transforms", &["none of the train images exists"]);
     place.fails("train both/transforms.json", &["none of the train images exists"]);
-    place.fails("train both --format llff", &["holds no capture in the format LLFF, but `transforms.json`, `sparse/0`"]);
+    place
+        .fails("train both --format llff", &["holds no capture in the format LLFF, but `transforms.json`, `sparse/0`"]);
     place.fails("train both --format other", &["--format", "use transforms, blender, colmap or llff"]);
 }
 
@@ -153,7 +154,10 @@ fn large_images_are_downscaled() {
     std::fs::write(place.path("large/transforms.json"), transforms.to_string()).unwrap();
     let train = |flags: &str, run: &str| {
         let said = said(&place, &format!("train large --steps 1 --out {run} {SMALL} {flags}"));
-        (said.contains("note: images are downscaled by 3, to 1068x3; --downscale 1 keeps their size"), place.json(&format!("{run}/config.json"))["downscale"].clone())
+        (
+            said.contains("note: images are downscaled by 3, to 1068x3; --downscale 1 keeps their size"),
+            place.json(&format!("{run}/config.json"))["downscale"].clone(),
+        )
     };
     assert_eq!(train("", "run"), (true, json!(3)));
     assert_eq!(train("--downscale 1", "whole"), (false, json!(1)));

@@ -107,6 +107,13 @@ impl Ndc {
         Err(Error::setting("ndc", "needs a near plane and slopes above 0, a finite eye, and axes that are a rotation"))
     }
 
+    /// Returns whether a point (scene units) is in the frustum, beyond its near plane.
+    pub fn contains(&self, place: DVec3) -> bool {
+        let local = self.axes.transpose() * (place - self.eye);
+        let widths = -local.z * DVec2::from(self.slopes);
+        -local.z >= self.near && local.xy().abs().cmple(widths).all()
+    }
+
     /// Returns the number of a camera's pixels across the frustum at the depth of `place`.
     pub fn pixels(&self, camera: &Camera, place: DVec3) -> f64 {
         let depth = self.axes.z_axis.dot(self.eye - place).max(self.near);
@@ -151,6 +158,14 @@ mod tests {
             }
         }
         assert!(widest.max_element() <= 1.0 && widest.min_element() > 0.8, "{widest}");
+        let inside = |x: f64, y: f64, depth: f64| {
+            let local = DVec3::new(x * ndc.slopes[0], y * ndc.slopes[1], -1.0) * depth * ndc.near;
+            ndc.contains(ndc.eye + ndc.axes * local)
+        };
+        assert!(inside(0.99, -0.99, 1.01) && inside(-0.99, 0.99, 50.0));
+        assert!(
+            !inside(0.0, 0.0, 0.99) && !inside(1.01, 0.0, 2.0) && !inside(0.0, -1.01, 2.0) && !inside(0.0, 0.0, -2.0)
+        );
         assert!(nearest >= ndc.near && nearest < ndc.near + 0.1, "{nearest} {}", ndc.near);
         // The margin is added to the camera that is turned most: by 6 degrees from the mean, towards negative x.
         let expected = 1.1 * (0.5_f64.atan() + 6.0_f64.to_radians()).tan();

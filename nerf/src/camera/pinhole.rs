@@ -129,6 +129,16 @@ impl Camera {
         (x * x + y * y) / (width * width + height * height)
     }
 
+    /// Returns the weight of the pixels of a row, 0.001 to 1: for an [equirectangular](Lens::Equirectangular) lens their
+    /// solid angle relative to the horizon, the cosine of the latitude; 1 for others.
+    pub fn row_weight(&self, row: usize) -> f64 {
+        match self.lens {
+            // Above 0, so that rejection by weights ends.
+            Lens::Equirectangular => self.plane(0.0, row as f64 + 0.5)[1].cos().max(1e-3),
+            _ => 1.0,
+        }
+    }
+
     /// Returns the same view at another image size.
     pub fn resized(&self, width: usize, height: usize) -> Self {
         let (sx, sy) = (width as f64 / self.width as f64, height as f64 / self.height as f64);

@@ -76,6 +76,23 @@ pub struct Frame {
     pub distances: Option<Image>,
 }
 
+impl Frame {
+    /// Returns the number of pixels that training and evaluation use.
+    pub fn used(&self) -> usize {
+        self.mask.as_ref().map_or(self.image.width * self.image.height, |mask| mask.used())
+    }
+
+    /// Returns the weight of a pixel in training and evaluation: 0 if it is masked, else its
+    /// [solid angle](Camera::row_weight).
+    ///
+    /// # Panics
+    /// If a mask is given and the pixel lies outside of it.
+    pub fn weight(&self, x: usize, y: usize) -> f64 {
+        let is_used = self.mask.as_ref().is_none_or(|mask| mask.uses(x, y));
+        if is_used { self.camera.row_weight(y) } else { 0.0 }
+    }
+}
+
 /// The images of one split, with the scene box, near and far plane.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Dataset {

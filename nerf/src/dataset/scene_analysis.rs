@@ -21,9 +21,9 @@ pub struct SceneAnalysis {
     pub scene_type: SceneType,
     /// Lower and upper corner of the scene box, in scene units.
     pub bounds: [DVec3; 2],
-    /// Near plane: distance along a ray, in scene units.
+    /// Near plane: distance along a ray, in scene units. No ray of a camera meets the box of a bounded scene before it.
     pub near: f64,
-    /// Far plane: distance along a ray, in scene units.
+    /// Far plane: distance along a ray, in scene units. No ray of a camera meets the box of a bounded scene behind it.
     pub far: f64,
     /// The NDC frustum of a [forward-facing](SceneType::ForwardFacing) scene.
     pub ndc: Option<Ndc>,
@@ -33,9 +33,13 @@ pub struct SceneAnalysis {
 
 /// Half of the box's side in scene units, as in the NeRF-synthetic scenes.
 const HALF_BOX: f64 = 1.5;
-/// Near and far of the NeRF-synthetic scenes. Their files do not give the scene's position, and all published work uses
-/// these.
-const CONVENTION: [f64; 2] = [2.0, 6.0];
+/// The scene box.
+const BOX: [DVec3; 2] = [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)];
+/// Distances of cameras from the origin that suggest the convention of the NeRF-synthetic scenes, whose files do not give
+/// the scene's position.
+const CONVENTION: [f64; 2] = [2.5, 5.5];
+/// The share by which near and far plane of a bounded scene exceed the box: pose refinement moves cameras.
+const MARGIN: f64 = 0.01;
 /// The default near plane of an unbounded scene, as a share of the cameras' distance from its centre.
 const NEAR_SHARE: f64 = 0.05;
 /// The far plane of an unbounded scene, in sides of its box.
@@ -46,6 +50,8 @@ const INNER_SHARE: f64 = 0.5;
 const AHEAD: f64 = 5.0;
 /// The same for cameras that look all around.
 const AROUND: f64 = 3.0;
+/// The share of all images that must show what one of them shows in a forward-facing scene: most of them.
+const SHARED: f64 = 0.5;
 /// Iterations of the reweighted least squares for the centre.
 const ROUNDS: usize = 8;
 
@@ -75,33 +81,34 @@ impl SceneAnalysis {
         // Opaque images show a background, wherever their cameras are.
         let bounded = asked.map_or(empty.is_some(), |scene_type| scene_type == SceneType::Bounded);
         if capture.format == Format::Blender && bounded && conventional(&cameras) {
+            let [near, far] = around_box(cameras.iter().map(|camera| camera.pose.translation), BOX);
             return Ok(SceneAnalysis {
                 transform: SceneTransform::default(),
                 scene_type: SceneType::Bounded,
-                bounds: [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)],
-                near: CONVENTION[0],
-                far: CONVENTION[1],
+                bounds: BOX,
+                near,
+                far,
                 ndc: None,
                 reason: "the NeRF-synthetic convention: all within 1.5 units of the origin".to_owned(),
             });
         }
-        let (scene_type, reason) = match (asked, empty) {
-            (Some(scene_type), _) => (scene_type, "as requested"),
-            (None, Some(why)) => (SceneType::Bounded, why),
-            (None, None) => {
-                if Ndc::around(cameras.iter().copied(), 1.0).is_ok() {
-                    (
-                        SceneType::ForwardFacing,
-                        "images are opaque, so they show a background, and all cameras look ahead",
-                    )
-                } else {
-                    (SceneType::Unbounded, "images are opaque, so they show a background")
-                }
-            }
-        };
         let depths: Vec<(&Camera, [f64; 2])> =
             capture.present().filter_map(|view| Some((&view.camera, view.bounds?))).collect();
         let points = trusted(&capture.points);
+        let (scene_type, reason) = match (asked, empty) {
+            (Some(scene_type), _) => (scene_type, "as requested"),
+            (None, Some(why)) => (SceneType::Bounded, why),
+            (None, None) if Ndc::around(cameras.iter().copied(), 1.0).is_err() => {
+                (SceneType::Unbounded, "images are opaque, so they show a background")
+            }
+            (None, None) if overlap(&cameras, &depths, &points).is_some_and(|share| share <= SHARED) => (
+                SceneType::Unbounded,
+                "images are opaque, and all cameras look ahead, but most images overlap little, as in an aerial survey",
+            ),
+            (None, None) => {
+                (SceneType::ForwardFacing, "images are opaque, so they show a background, and all cameras look ahead")
+            }
+        };
         let Layout { middle, inner, looks } = Layout::new(&cameras, &depths, &points);
         let sideways = if is_sideways(&cameras) { "; all images are on their side" } else { "" };
         let reason = format!("{reason}; {looks}{sideways}");
@@ -115,22 +122,15 @@ impl SceneAnalysis {
             SceneType::Unbounded | SceneType::ForwardFacing => inner,
         };
         let transform = SceneTransform { rotation: upright(&cameras), scale: HALF_BOX / half, origin: middle };
-        let bounds = [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)];
         let [near, far] = match scene_type {
-            SceneType::Bounded => {
-                let distances = || cameras.iter().map(|camera| camera.pose.translation.distance(middle));
-                let reach = 3.0_f64.sqrt() * half;
-                let nearest = distances().fold(f64::INFINITY, f64::min);
-                [(nearest - reach).max(NEAR_SHARE * distance), distances().fold(0.0, f64::max) + reach]
-            }
+            SceneType::Bounded => around_box(cameras.iter().map(|c| transform.point(c.pose.translation)), BOX),
             SceneType::Unbounded | SceneType::ForwardFacing => {
                 let given = depths.iter().map(|(_, [near, _])| *near).reduce(f64::min);
                 let near = given.or_else(|| nearest_point(&cameras, &points));
                 let near = near.map_or(NEAR_SHARE * distance, |near| 0.5 * near);
-                [near.min(0.5 * distance), FAR_SIDES * 2.0 * half]
+                [near.min(0.5 * distance), FAR_SIDES * 2.0 * half].map(|length| length * transform.scale)
             }
         };
-        let [near, far] = [near, far].map(|length| length * transform.scale);
         let ndc = match scene_type {
             SceneType::ForwardFacing => {
                 let placed: Vec<Camera> = cameras.iter().map(|camera| transform.camera(camera)).collect();
@@ -138,7 +138,7 @@ impl SceneAnalysis {
             }
             SceneType::Bounded | SceneType::Unbounded => None,
         };
-        Ok(SceneAnalysis { transform, scene_type, bounds, near, far, ndc, reason })
+        Ok(SceneAnalysis { transform, scene_type, bounds: BOX, near, far, ndc, reason })
     }
 }
 
@@ -151,12 +151,22 @@ impl Capture {
 
 /// Returns true if the cameras are around the origin like those of the NeRF-synthetic scenes, and look at it.
 fn conventional(cameras: &[&Camera]) -> bool {
-    let [near, far] = CONVENTION;
+    let [least, most] = CONVENTION;
     cameras.iter().all(|camera| {
         let eye = camera.pose.translation;
         let looks = -camera.pose.matrix3.z_axis;
-        (near + 0.5..far - 0.5).contains(&eye.length()) && looks.dot(-eye.normalize()) > 0.7
+        (least..most).contains(&eye.length()) && looks.dot(-eye.normalize()) > 0.7
     })
+}
+
+/// The near and far plane of a bounded scene: the distances between which rays from the eyes, in any direction, can be in
+/// the box; near is 0 if an eye is inside.
+fn around_box(eyes: impl Iterator<Item = DVec3>, [low, high]: [DVec3; 2]) -> [f64; 2] {
+    let [near, far] = eyes.fold([f64::INFINITY, 0.0], |[near, far], eye| {
+        let corner = (eye - low).abs().max((eye - high).abs());
+        [near.min(eye.distance(eye.clamp(low, high))), far.max(corner.length())]
+    });
+    [(1.0 - MARGIN) * near, (1.0 + MARGIN) * far]
 }
 
 /// The position and size of the scene, from the cameras' arrangement.
@@ -173,18 +183,21 @@ impl Layout {
     /// half of all. `points` are a sample of the visible points.
     fn new(cameras: &[&Camera], depths: &[(&Camera, [f64; 2])], points: &[DVec3]) -> Self {
         let distances = |middle: DVec3| median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
+        let mean = average(cameras, |pose| pose.translation);
+        let forward = average(cameras, |pose| -pose.matrix3.z_axis);
+        let spread = distances(mean);
+        let is_parallel = forward.length() > 0.8;
         if 2 * depths.len() >= cameras.len() {
             let middle = ahead(depths);
-            return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "depths give its position" };
+            // The box holds all of a flight, whose cameras may move farther than they look.
+            let inner = (INNER_SHARE * distances(middle)).max(if is_parallel { spread } else { 0.0 });
+            return Layout { middle, inner, looks: "depths give its position" };
         }
         if let Some(middle) = middle(cameras) {
             return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "cameras look at one place" };
         }
-        let mean = average(cameras, |pose| pose.translation);
-        let forward = average(cameras, |pose| -pose.matrix3.z_axis);
-        let spread = distances(mean);
         let known = points.len() >= FEWEST;
-        if forward.length() > 0.8 {
+        if is_parallel {
             let forward = forward.normalize();
             let depth = known.then(|| median(points.iter().map(|point| (*point - mean).dot(forward))));
             let middle = mean + depth.filter(|depth| *depth > 0.0).unwrap_or(AHEAD * spread) * forward;
@@ -234,9 +247,16 @@ fn average(cameras: &[&Camera], of: fn(&DAffine3) -> DVec3) -> DVec3 {
 
 /// The centre of the scene for cameras with known near and far depths: halfway in inverse depth along the axes.
 fn ahead(depths: &[(&Camera, [f64; 2])]) -> DVec3 {
-    mean(depths.iter().map(|(camera, [near, far])| {
-        camera.pose.translation - camera.pose.matrix3.z_axis * (2.0 / (1.0 / near + 1.0 / far))
-    }))
+    mean(
+        depths
+            .iter()
+            .map(|(camera, depths)| camera.pose.translation - camera.pose.matrix3.z_axis * middle_depth(*depths)),
+    )
+}
+
+/// Halfway in inverse depth.
+fn middle_depth([near, far]: [f64; 2]) -> f64 {
+    2.0 / (1.0 / near + 1.0 / far)
 }
 
 /// The least length of the mean of axes that are nearly parallel.
@@ -301,6 +321,34 @@ fn half_width(cameras: &[&Camera], middle: DVec3) -> f64 {
 const ASKED: [usize; 2] = [64, 20_000];
 /// The fewest points that are used.
 const FEWEST: usize = 100;
+
+/// The share of the images that show a point, averaged over the points of each image: the mean overlap of two images.
+/// Without points it takes the middle depths of the images; `None` without either.
+fn overlap(cameras: &[&Camera], depths: &[(&Camera, [f64; 2])], points: &[DVec3]) -> Option<f64> {
+    /// Places along each side of an image.
+    const PLACES: usize = 8;
+    let sample = evenly_spaced((0..cameras.len()).collect(), ASKED[0]);
+    let at_depth = |(camera, depths): (&Camera, [f64; 2])| -> Vec<DVec3> {
+        let depth = middle_depth(depths);
+        let place = |i: usize, side: usize| (i as f64 + 0.5) / PLACES as f64 * side as f64;
+        let point = |i: usize| {
+            let ray = camera.ray(place(i % PLACES, camera.width), place(i / PLACES, camera.height));
+            ray.at(depth / ray.direction.dot(-camera.pose.matrix3.z_axis))
+        };
+        (0..PLACES * PLACES).map(point).collect()
+    };
+    let points: Vec<DVec3> = match points.len() >= FEWEST {
+        true => points.to_vec(),
+        false if 2 * depths.len() >= cameras.len() => {
+            evenly_spaced(depths.to_vec(), ASKED[0]).into_iter().flat_map(at_depth).collect()
+        }
+        false => return None,
+    };
+    let shown = |i: usize| sample.iter().filter(|number| cameras[**number].shows(points[i])).count() as f64;
+    let counts = parallel::collect(points.len(), shown);
+    let sum: f64 = counts.iter().sum();
+    (sum > 0.0).then(|| counts.iter().map(|count| count * count).sum::<f64>() / (sum * sample.len() as f64))
+}
 
 /// A sample of the reliable points.
 fn trusted(points: &[Point]) -> Vec<DVec3> {

@@ -14,7 +14,7 @@ pub enum SceneType {
     Bounded,
     /// Unbounded: the images show a background beyond the scene box.
     Unbounded,
-    /// Forward-facing: unbounded, and all cameras look the same way; see [`Ndc`](crate::Ndc).
+    /// Forward-facing: unbounded, and all cameras look the same way at one part of the scene; see [`Ndc`](crate::Ndc).
     #[serde(alias = "forward")]
     ForwardFacing,
 }

@@ -2,7 +2,7 @@
 
 use super::mesh::Mesh;
 use crate::dataset::SceneTransform;
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 
 /// A mesh whose vertices have normals and colours; without triangles, a point cloud.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -23,6 +23,12 @@ impl From<Mesh> for ColoredMesh {
 }
 
 impl ColoredMesh {
+    /// Rotates positions and normals.
+    pub(super) fn rotate(&mut self, rotation: DMat3) {
+        let vectors = self.mesh.positions.iter_mut().chain(&mut self.normals);
+        vectors.for_each(|vector| *vector = rotation * *vector);
+    }
+
     /// Maps scene coordinates to those of the capture.
     pub fn into_capture(mut self, transform: &SceneTransform) -> Self {
         self.mesh.positions.iter_mut().for_each(|place| *place = transform.point_back(*place));

@@ -2,6 +2,7 @@
 
 use super::colored_mesh::ColoredMesh;
 use super::mesh::{Mesh, bounds};
+use super::oriented_box::OrientedBox;
 use super::probe::Probe;
 use super::sight::views;
 use super::surface::Stage;
@@ -29,7 +30,8 @@ pub struct PointCloud {
 }
 
 impl Model<f32> {
-    /// Extracts visible points within the scene box, with normals and colours as in [`surface`](Self::surface).
+    /// Extracts visible points within `region`, the scene box by default, with normals and colours as in
+    /// [`surface`](Self::surface).
     ///
     /// A point lies where half of a ray's light is blocked, for opaque rays of the `cameras`. Points are thinned to at
     /// most `count`, one per voxel of a grid, so that they are about evenly spaced. `progress` receives the stage and
@@ -41,6 +43,7 @@ impl Model<f32> {
         &self,
         cameras: &[Camera],
         count: usize,
+        region: Option<OrientedBox>,
         progress: &mut dyn FnMut(Stage, f64),
     ) -> Result<PointCloud> {
         // Each camera gets the same number of rays, for any image size.
@@ -48,11 +51,14 @@ impl Model<f32> {
         let scale = |camera: &Camera| (rays / (camera.width * camera.height) as f64).sqrt();
         let views = views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done));
         let seen = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten().map(|sight| sight.place));
-        let places: Vec<DVec3> = seen.filter(|place| self.scene_box.contains(*place)).collect();
+        let probe = Probe::new(self, region);
+        let region = probe.region();
+        let local = seen.map(|place| region.local(place));
+        let places: Vec<DVec3> = local.filter(|place| region.contains_local(*place)).collect();
         if places.is_empty() {
             return Err(Error::setting(
                 "points",
-                "cannot be found: no camera sees a surface; train longer or check the cameras",
+                "cannot be found: no camera sees a surface in the box; train longer or check the cameras and the box",
             ));
         }
         let seeing = views.iter().fold(Evaluations::default(), |sum, (_, seen)| sum + seen.evaluations);
@@ -60,11 +66,11 @@ impl Model<f32> {
         let sights = places.len();
         let positions = thinned(&places, count);
         progress(Stage::Coloring, 0.0);
-        let probe = Probe::new(self);
         let (normals, colors) = probe.look(self.cells(), self.judged(self.cells()), &positions);
-        let mesh = Mesh { positions, triangles: vec![] };
+        let mut colored_mesh = ColoredMesh { mesh: Mesh { positions, triangles: vec![] }, normals, colors };
+        colored_mesh.rotate(region.rotation);
         let evaluations = seeing + probe.evaluations();
-        Ok(PointCloud { colored_mesh: ColoredMesh { mesh, normals, colors }, sights, evaluations })
+        Ok(PointCloud { colored_mesh, sights, evaluations })
     }
 }
 

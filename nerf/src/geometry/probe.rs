@@ -1,5 +1,6 @@
-//! Evaluation of a model at points, as renders see it.
+//! Evaluation of a model at points of a box, as renders see it.
 
+use super::oriented_box::OrientedBox;
 use super::unseen::Hidden;
 use crate::camera::pinhole::Ray;
 use crate::camera::rays::{Rays, Samples};
@@ -16,14 +17,40 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// Evaluates a model at points and counts the evaluations.
 pub(super) struct Probe<'a> {
     model: &'a Model<f32>,
+    /// The box of the extraction.
+    region: OrientedBox,
+    /// The box in which the model has densities, in scene units.
+    reach: [DVec3; 2],
     pool: Pool<f32>,
     densities: AtomicU64,
     colors: AtomicU64,
 }
 
 impl<'a> Probe<'a> {
-    pub fn new(model: &'a Model<f32>) -> Self {
-        Probe { model, pool: Pool::new(), densities: AtomicU64::new(0), colors: AtomicU64::new(0) }
+    /// Probes a model within `region`; `None` for the scene box.
+    pub fn new(model: &'a Model<f32>, region: Option<OrientedBox>) -> Self {
+        let [low, high] = model.scene_box.bounds;
+        let reach = model.reach();
+        Probe {
+            model,
+            region: region.unwrap_or_else(|| model.scene_box.bounds.into()),
+            reach: [reach[0].min(low), reach[1].max(high)],
+            pool: Pool::new(),
+            densities: AtomicU64::new(0),
+            colors: AtomicU64::new(0),
+        }
+    }
+
+    /// The box of the extraction.
+    pub fn region(&self) -> OrientedBox {
+        self.region
+    }
+
+    /// The smallest box along the axes of the scene that holds all densities of the region.
+    pub fn bounds(&self) -> [DVec3; 2] {
+        let corners = self.region.corners();
+        let [low, high] = corners.iter().fold([corners[0]; 2], |[low, high], &x| [low.min(x), high.max(x)]);
+        [low.max(self.reach[0]), high.min(self.reach[1])]
     }
 
     /// The number of evaluations of the model so far.
@@ -38,8 +65,8 @@ impl<'a> Probe<'a> {
         densities(&*self.model.field, &self.model.params, &self.pool, points, out);
     }
 
-    /// The densities of renders: 0 outside of the model's box and in empty cells of the grid, if there is one. Hidden
-    /// points get an infinite density. Returns the largest density of the others.
+    /// The densities of renders at points along the axes of the region: 0 outside of it and in empty cells of the grid,
+    /// if there is one. Hidden points get an infinite density. Returns the largest density of the others.
     pub fn shown(
         &self,
         grid: Option<&OccupancyGrid>,
@@ -47,9 +74,14 @@ impl<'a> Probe<'a> {
         points: &[[f32; 3]],
         out: &mut [f32],
     ) -> f32 {
-        let place = |row: usize| DVec3::from(points[row].map(f64::from));
+        let local = |row: usize| DVec3::from(points[row].map(f64::from));
+        let place = |row: usize| self.region.rotation * local(row);
         let is_occupied = |place: DVec3| grid.is_none_or(|grid| grid.is_occupied(place));
-        let is_shown = |row: &usize| self.model.scene_box.contains(place(*row)) && is_occupied(place(*row));
+        let is_reached = |place: DVec3| place.cmpge(self.reach[0]).all() && place.cmple(self.reach[1]).all();
+        let is_shown = |row: &usize| {
+            let place = place(*row);
+            self.region.contains_local(local(*row)) && is_reached(place) && is_occupied(place)
+        };
         let rows: Vec<usize> = (0..points.len()).filter(is_shown).collect();
         out.fill(0.0);
         let is_hidden = |row: usize| hidden.is_some_and(|hidden| hidden.holds(place(row)));
@@ -58,14 +90,15 @@ impl<'a> Probe<'a> {
         if rows.is_empty() {
             return 0.0;
         }
-        let asked: Vec<[f32; 3]> = rows.iter().map(|&row| points[row]).collect();
+        let asked: Vec<[f32; 3]> = rows.iter().map(|&row| place(row).as_vec3().to_array()).collect();
         let mut found = vec![0.0; rows.len()];
         self.densities(&asked, &mut found);
         rows.iter().zip(&found).for_each(|(&row, &sigma)| out[row] = sigma);
         found.into_iter().fold(0.0, f32::max)
     }
 
-    /// For each place the unit normal, and the colour that is seen when one looks along it from outside, in sRGB.
+    /// For each place the unit normal, both along the axes of the region, and the colour that is seen when one looks
+    /// along it from outside, in sRGB.
     ///
     /// The normal is against the slope of `ln(1 + reach density)` from `reach` before a place to `reach` behind it,
     /// along each axis. The field's own gradient would show noise finer than a pixel. Where there is no slope, the
@@ -101,8 +134,9 @@ impl<'a> Probe<'a> {
         let tape = Tape::with_pool(self.pool.clone());
         let params = self.model.params.bind_constant(&tape);
         let mut rays = Rays::new();
-        for (&origin, normal) in places.iter().zip(normals) {
-            rays.push(&Ray { origin, direction: -normal }, [0.0, 1.0]);
+        for (place, normal) in places.iter().zip(normals) {
+            let [origin, direction] = [*place, -normal].map(|vector| self.region.rotation * vector);
+            rays.push(&Ray { origin, direction }, [0.0, 1.0]);
         }
         let count = rays.len();
         let (here, one) = (Tensor::zeros(&[count]), Tensor::ones(&[count]));

@@ -2,6 +2,7 @@
 
 use super::colored_mesh::ColoredMesh;
 use super::isosurface::{Lattice, MOST_CELLS, isosurface};
+use super::oriented_box::OrientedBox;
 use super::probe::Probe;
 use super::sight::{Seen, views};
 use super::unseen::Hidden;
@@ -26,6 +27,9 @@ const PIXELS: f64 = 128.0;
 /// Configuration of [`Model::surface`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SurfaceConfig {
+    /// The box of the surface; `None` takes the scene box. There is no surface where the model has no densities: beyond
+    /// the scene box of a bounded scene, and beyond the [reach](Model::reach) of others.
+    pub region: Option<OrientedBox>,
     /// Lattice cells along the longest side of the box, 1 to 4096. `None` takes two per cell of the model's occupancy
     /// grid, or 256 without a grid.
     pub resolution: Option<usize>,
@@ -45,6 +49,7 @@ pub struct SurfaceConfig {
 impl Default for SurfaceConfig {
     fn default() -> Self {
         SurfaceConfig {
+            region: None,
             resolution: None,
             iso_value: None,
             min_component: 0.01,
@@ -95,7 +100,8 @@ pub struct Surface {
 }
 
 impl Model<f32> {
-    /// Extracts the surface within the scene box; in an unbounded scene, the part of it that cameras look at.
+    /// Extracts the surface within a [box](SurfaceConfig::region). The scene box of an unbounded scene is the part that
+    /// cameras look at.
     ///
     /// It is the isosurface of the density at the [iso-value](SurfaceConfig::iso_value). The default iso-value is the
     /// lower quartile of the densities where half of a ray's light is blocked, over opaque rays of the `cameras`. So
@@ -113,18 +119,19 @@ impl Model<f32> {
         progress: &mut dyn FnMut(Stage, f64),
     ) -> Result<Surface> {
         config.check()?;
-        let (probe, bounds) = (Probe::new(self), self.scene_box.bounds);
+        let probe = Probe::new(self, config.region);
+        let region = probe.region();
         let views = if config.fill_unseen || config.iso_value.is_none() {
             let scale = |camera: &Camera| (PIXELS / camera.width.max(camera.height) as f64).min(1.0);
             views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done))
         } else {
             vec![]
         };
-        let level = config.iso_value.map_or_else(|| self.level(&views), Ok)?;
+        let level = config.iso_value.map_or_else(|| level(&views, &region), Ok)?;
         let grid = match self.cells() {
             Some(grid) => Cow::Borrowed(grid),
             None => {
-                let mut grid = OccupancyGrid::new(bounds, &OccupancyConfig::default())?;
+                let mut grid = OccupancyGrid::new(probe.bounds(), &OccupancyConfig::default())?;
                 grid.rebuild((FAINT * level) as f32, true, &|points, out| probe.densities(points, out));
                 Cow::Owned(grid)
             }
@@ -132,7 +139,8 @@ impl Model<f32> {
         let judged = self.judged(Some(&grid));
         let hidden = config.fill_unseen.then(|| Hidden::new(&views, judged));
         let resolution = config.resolution.unwrap_or(FINER * grid.resolution());
-        let lattice = Lattice::over(if config.closed { bounds } else { within(bounds) }, resolution, config.closed)?;
+        let bounds = if config.closed { region.bounds } else { within(region.bounds) };
+        let lattice = Lattice::over(bounds, resolution, config.closed)?;
         // Unseen points have infinite density, above any iso-value.
         let is_met = AtomicBool::new(false);
         let shown = |points: &[[f32; 3]], out: &mut [f32]| {
@@ -142,7 +150,10 @@ impl Model<f32> {
         };
         let mut mesh = isosurface(&lattice, level as f32, &shown, &mut |done| progress(Stage::Meshing, done))?;
         if mesh.triangles.is_empty() || !is_met.into_inner() {
-            return Err(Error::setting("iso_value", format!("is {level}, above all densities; use a smaller one")));
+            return Err(Error::setting(
+                "iso_value",
+                format!("is {level}, above all densities in the box; use a smaller one, or another box"),
+            ));
         }
         let dropped = mesh.drop_small_components(config.min_component);
         if let Some(count) = config.triangles {
@@ -151,13 +162,9 @@ impl Model<f32> {
         progress(Stage::Coloring, 0.0);
         let (normals, colors) = probe.look(Some(&grid), judged, &mesh.positions);
         let evaluations = views.iter().fold(probe.evaluations(), |sum, (_, seen)| sum + seen.evaluations);
-        Ok(Surface {
-            colored_mesh: ColoredMesh { mesh, normals, colors },
-            iso_value: level,
-            resolution,
-            dropped,
-            evaluations,
-        })
+        let mut colored_mesh = ColoredMesh { mesh, normals, colors };
+        colored_mesh.rotate(region.rotation);
+        Ok(Surface { colored_mesh, iso_value: level, resolution, dropped, evaluations })
     }
 
     /// The occupancy grid of renders, if they skip cells.
@@ -170,19 +177,20 @@ impl Model<f32> {
         let cells = grid.map_or_else(|| OccupancyConfig::default().resolution, OccupancyGrid::resolution);
         self.scene_box.space().side() / cells as f64
     }
+}
 
-    /// The lower quartile of the densities at the visible points in the box. A higher iso-value would make holes in the
-    /// surface. A lower one moves it outwards only a little.
-    fn level(&self, views: &[(Camera, Seen)]) -> Result<f64> {
-        let sights = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten());
-        let mut sigmas: Vec<f64> =
-            sights.filter(|sight| self.scene_box.contains(sight.place)).map(|sight| sight.sigma).collect();
-        let quarter = sigmas.len() / 4;
-        if sigmas.is_empty() {
-            return Err(Error::setting("iso_value", "is missing, and no camera sees a surface to estimate it; set it"));
-        }
-        Ok(*sigmas.select_nth_unstable_by(quarter, f64::total_cmp).1)
+/// The lower quartile of the densities at the visible points in the box. A higher iso-value would make holes in the
+/// surface. A lower one moves it outwards only a little.
+fn level(views: &[(Camera, Seen)], region: &OrientedBox) -> Result<f64> {
+    let sights = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten());
+    let inside = sights.filter(|sight| region.contains_local(region.local(sight.place)));
+    let mut sigmas: Vec<f64> = inside.map(|sight| sight.sigma).collect();
+    let quarter = sigmas.len() / 4;
+    if sigmas.is_empty() {
+        let what = "is missing, and no camera sees a surface in the box to estimate it; set it";
+        return Err(Error::setting("iso_value", what));
     }
+    Ok(*sigmas.select_nth_unstable_by(quarter, f64::total_cmp).1)
 }
 
 /// The largest box with f32 corners inside this one, so that points on its faces stay in the box.

@@ -12,9 +12,30 @@ use crate::dataset::image::Image;
 /// If the images differ in size or channels.
 #[track_caller]
 pub fn mse(a: &Image, b: &Image) -> f64 {
+    weighted_mse(a, b, |_, _| 1.0)
+}
+
+/// Computes the mean squared error with a weight for each pixel (column, row), at least 0. Pixels of weight 0 are not
+/// compared; without others it is NaN.
+///
+/// With the weights of a [frame](crate::dataset::Frame::weight) its [PSNR](psnr_from_mse) leaves out masked pixels. For
+/// a panorama it is then the WS-PSNR (Sun, Lu and Yu 2017), which weights pixels by their solid angle.
+///
+/// # Panics
+/// If the images differ in size or channels.
+#[track_caller]
+pub fn weighted_mse(a: &Image, b: &Image, weight: impl Fn(usize, usize) -> f64) -> f64 {
     a.assert_same_shape(b);
-    let squares = a.data.iter().zip(&b.data).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2));
-    squares.sum::<f64>() / a.data.len() as f64
+    let (mut sum, mut total) = (0.0, 0.0);
+    for (x, y) in (0..a.height).flat_map(|y| (0..a.width).map(move |x| (x, y))) {
+        let weight = weight(x, y);
+        if weight > 0.0 {
+            let squares = a.pixel(x, y).iter().zip(b.pixel(x, y)).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2));
+            squares.for_each(|square| sum += weight * square);
+            total += weight;
+        }
+    }
+    sum / (total * a.channels as f64)
 }
 
 /// Computes the peak signal-to-noise ratio in dB for a peak of 1: `-10 log10(mse)`. Identical images give +infinity.
@@ -198,6 +219,22 @@ mod tests {
         assert_eq!(mse(&constant(0.25), &constant(0.75)), 0.25);
         assert_eq!(psnr_from_mse(0.01), 20.0);
         assert_eq!(psnr_from_mse(0.0), f64::INFINITY);
+    }
+
+    #[test]
+    fn weighted_error_is_that_of_the_weighted_pixels() {
+        let (a, mut b) = (constant(0.5), noise(1, &constant(0.5), 1.0));
+        assert_eq!(weighted_mse(&a, &b, |_, _| 1.0).to_bits(), mse(&a, &b).to_bits());
+        assert!((weighted_mse(&a, &b, |_, _| 0.3) / mse(&a, &b) - 1.0).abs() < 1e-12);
+        // Two pixels of weights 1 and 3, errors .1 and .2; another one is left out.
+        b.data.fill(0.5);
+        b.pixel_mut(2, 1).fill(0.6);
+        b.pixel_mut(15, 12).fill(0.7);
+        b.pixel_mut(0, 0).fill(f32::NAN);
+        let weight =
+            |x: usize, y: usize| [([2, 1], 1.0), ([15, 12], 3.0)].iter().find(|w| w.0 == [x, y]).map_or(0.0, |w| w.1);
+        assert!((weighted_mse(&a, &b, weight) - (0.01 + 3.0 * 0.04) / 4.0).abs() < 1e-7);
+        assert!(weighted_mse(&a, &b, |_, _| 0.0).is_nan());
     }
 
     #[test]

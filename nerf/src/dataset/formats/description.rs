@@ -111,7 +111,10 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>) -> Result<Cap
         let (_, capture) = captures.swap_remove(damaged);
         let other = captures.iter().find(|(_, capture)| present(capture) > 0).map(|(other, _)| *other);
         let advice = other.map(|other| format!("to use `{}` instead, name {}", other.name(), other.file.display()));
-        return capture.map_err(|error| advice.map_or(error, |advice| error.with(&advice)));
+        return capture.map_err(|error| match advice {
+            Some(advice) => error.with(&advice),
+            None => error,
+        });
     }
     let count = |(description, capture): &(&Description, Result<Capture>)| match capture {
         Ok(capture) => format!("`{}` {} of {}", description.name(), capture.present().count(), capture.views.len()),

@@ -207,7 +207,90 @@ fn bounded_scene_is_as_wide_as_cameras_see() {
     let half = 1.5 / analysis.transform.scale;
     assert!((half - 2.4).abs() < 0.02, "{half}");
     let (near, far) = (analysis.near / analysis.transform.scale, analysis.far / analysis.transform.scale);
-    assert!((near - 0.2).abs() < 0.02 && (far - (8.0 + 3.0_f64.sqrt() * 2.4)).abs() < 0.1, "{near} {far}");
+    // The first camera is 3 - 2.4 from the box, the last 8 + 2.4 along x from its far side; both with a margin of 1 %.
+    assert!((near - 0.99 * 0.6).abs() < 0.03, "{near}");
+    assert!((far - 1.01 * DVec3::new(10.4, 2.4, 2.4).length()).abs() < 0.1, "{far}");
+}
+
+#[test]
+fn near_and_far_of_bounded_scenes_hold_the_box() {
+    let orbit = |radius: f64| {
+        let eye = |i: usize| {
+            let (sin, cos) = (0.7 * i as f64).sin_cos();
+            radius * DVec3::new(0.8 * cos, 0.8 * sin, 0.6)
+        };
+        let cameras = (0..9).map(|i| camera(eye(i), DVec3::ZERO, DVec3::Z)).collect();
+        SceneAnalysis::new(&capture(Format::Blender, cameras), Some("it is transparent"), None).unwrap()
+    };
+    // Lego-like, near, and beyond the convention.
+    for radius in [4.0, 2.6, 9.0] {
+        let analysis = orbit(radius);
+        let [mut near, mut far] = [f64::INFINITY, 0.0_f64];
+        for i in 0..9 {
+            let (sin, cos) = (0.7 * f64::from(i)).sin_cos();
+            let eye = analysis.transform.point(radius * DVec3::new(0.8 * cos, 0.8 * sin, 0.6));
+            for j in 0..60 * 60 {
+                let target = 1.499 * DVec3::new(f64::from(j % 60) / 29.5 - 1.0, f64::from(j / 60) / 29.5 - 1.0, 0.0);
+                for target in [target, target + 1.499 * DVec3::Z, target - 1.499 * DVec3::Z] {
+                    let ray = crate::Ray { origin: eye, direction: (target - eye).normalize() };
+                    let [enter, leave] = crate::intersect_box(&ray, analysis.bounds).unwrap();
+                    (near, far) = (near.min(enter), far.max(leave));
+                }
+            }
+        }
+        // All of the box is within the planes, and they are no farther apart than its rays need.
+        assert!((0.95 * near..=near).contains(&analysis.near), "{radius}: {near} {}", analysis.near);
+        assert!((far..1.05 * far).contains(&analysis.far), "{radius}: {far} {}", analysis.far);
+    }
+    // Some of the box is visible from inside.
+    let mut inside = capture(Format::Transforms, quarter(4.0));
+    inside.views[0].camera.pose.translation = CENTRE + DVec3::new(0.1, 0.2, 0.3);
+    let inside = SceneAnalysis::new(&inside, Some("it is transparent"), None).unwrap();
+    assert_eq!(inside.near, 0.0);
+}
+
+/// 5 x 5 cameras in a grid that look straight down from a height of 50 with one heading, and points on the ground. An
+/// image shows 40 x 60 units.
+fn nadir(spacing: f64, format: Format) -> Capture {
+    let eye = |i: usize| spacing * DVec3::new((i % 5) as f64 - 2.0, (i / 5) as f64 - 2.0, 0.0) + 50.0 * DVec3::Z;
+    let mut capture = capture(format, (0..25).map(|i| camera(eye(i), eye(i) - DVec3::Z, DVec3::Y)).collect());
+    let half = DVec3::new(2.0 * spacing + 20.0, 2.0 * spacing + 30.0, 2.0);
+    let point = |i: usize| half * DVec3::new((7.1 * i as f64).sin(), (3.3 * i as f64).cos(), (5.7 * i as f64).sin());
+    capture.points = (0..900).map(|i| Point { position: point(i), color: [0; 3], error: 1.0, views: 3 }).collect();
+    capture
+}
+
+#[test]
+fn aerial_survey_is_not_forward_facing() {
+    let known_by_depths = |mut capture: Capture| {
+        capture.points.clear();
+        capture.views.iter_mut().for_each(|view| view.bounds = Some([45.0, 55.0]));
+        capture
+    };
+    // Neighbours overlap by 70 % along x, as in a survey, or by 95 %, as in LLFF's arrays.
+    for (spacing, expected) in [(12.0, SceneType::Unbounded), (2.0, SceneType::ForwardFacing)] {
+        for capture in [nadir(spacing, Format::Colmap), known_by_depths(nadir(spacing, Format::Llff))] {
+            assert!(Ndc::around(capture.views.iter().map(|view| &view.camera), 1.0).is_ok());
+            let analysis = SceneAnalysis::new(&capture, None, None).unwrap();
+            assert_eq!((analysis.scene_type, analysis.ndc.is_some()), (expected, expected != SceneType::Unbounded));
+            let is_survey = analysis.reason.contains("most images overlap little, as in an aerial survey");
+            assert_eq!(is_survey, expected == SceneType::Unbounded, "{}", analysis.reason);
+            // The ground is in the middle of the box, and nothing of it is before the near plane.
+            let near = analysis.near / analysis.transform.scale;
+            assert!(analysis.transform.origin.length() < 1.0 && near < 48.0, "{near} {analysis:?}");
+            let asked = SceneAnalysis::new(&capture, None, Some(SceneType::ForwardFacing)).unwrap();
+            assert!(asked.ndc.is_some());
+        }
+    }
+    // The box of a wide flight holds it, whether points or depths give the distance.
+    for capture in [nadir(60.0, Format::Colmap), known_by_depths(nadir(60.0, Format::Llff))] {
+        let half = 1.5 / SceneAnalysis::new(&capture, None, None).unwrap().transform.scale;
+        assert!(half > 119.0, "{half}");
+    }
+    // Too few points leave the distance open.
+    let mut unknown = nadir(12.0, Format::Colmap);
+    unknown.points.truncate(99);
+    assert_eq!(SceneAnalysis::new(&unknown, None, None).unwrap().scene_type, SceneType::ForwardFacing);
 }
 
 #[test]
@@ -265,7 +348,7 @@ fn scene_type_flag_beats_convention_beats_alpha() {
     let asked = SceneAnalysis::new(&around(4.0), None, Some(SceneType::Bounded)).unwrap();
     let conventional = SceneAnalysis::new(&around(4.0), Some("it is transparent"), None).unwrap();
     assert_eq!(asked, conventional);
-    assert_eq!((conventional.near, conventional.far, conventional.transform), (2.0, 6.0, SceneTransform::default()));
+    assert_eq!(conventional.transform, SceneTransform::default());
     assert_eq!(conventional.scene_type, SceneType::Bounded);
     assert_eq!(
         SceneAnalysis::new(&around(4.0), Some("it is transparent"), Some(SceneType::Unbounded)).unwrap().scene_type,

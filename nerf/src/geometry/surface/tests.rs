@@ -71,6 +71,7 @@ fn surface(model: &Model<f32>, config: &SurfaceConfig) -> Surface {
 
 /// The resolution suits the balls.
 const CONFIG: SurfaceConfig = SurfaceConfig {
+    region: None,
     resolution: Some(80),
     iso_value: None,
     min_component: 0.01,
@@ -211,7 +212,7 @@ fn surface_errors_name_the_setting() {
     for cameras in [vec![], vec![away.clone()]] {
         let said = message(CONFIG, &cameras);
         assert!(said.contains("`iso_value`: is missing, and no camera sees a surface"), "{said}");
-        let said = ball().point_cloud(&cameras, 10, &mut |_, _| ()).err().unwrap().to_string();
+        let said = ball().point_cloud(&cameras, 10, None, &mut |_, _| ()).err().unwrap().to_string();
         assert!(said.contains("`points`: cannot be found: no camera sees a surface"), "{said}");
     }
 }
@@ -219,7 +220,7 @@ fn surface_errors_name_the_setting() {
 #[test]
 fn point_cloud_covers_the_visible_surface() {
     let model = ball();
-    let found = model.point_cloud(&cameras(), 2000, &mut |_, done| assert!((0.0..=1.0).contains(&done))).unwrap();
+    let found = model.point_cloud(&cameras(), 2000, None, &mut |_, done| assert!((0.0..=1.0).contains(&done))).unwrap();
     let ColoredMesh { mesh, normals, colors } = &found.colored_mesh;
     let count = mesh.positions.len();
     assert!((1500..=2000).contains(&count) && mesh.triangles.is_empty(), "{count}");
@@ -293,7 +294,7 @@ fn surface_colors_have_the_exposure_of_renders() {
     // centre.
     for (look, gains) in [(Some(0), gains[0]), (Some(1), gains[1]), (None, [0.5_f32.sqrt(), 0.5, 0.5])] {
         model.appearance_image = look;
-        let (_, colors) = Probe::new(&model).look(None, 0.02, &places);
+        let (_, colors) = Probe::new(&model, None).look(None, 0.02, &places);
         for (found, expected) in colors[0].iter().zip([0.8, 0.5, 0.9].into_iter().zip(gains)) {
             assert!((f32::from(*found) - 255.0 * expected.0 * expected.1).abs() < 1.5, "{look:?}: {colors:?}");
         }
@@ -301,9 +302,66 @@ fn surface_colors_have_the_exposure_of_renders() {
 }
 
 #[test]
+fn surface_and_points_of_an_oriented_box() {
+    // Along axes that are turned about z, from the ball's centre on. Normals see the cut up to a cell of 0.08 away.
+    let rotation = glam::DMat3::from_rotation_z(0.6);
+    let [low, high] = [DVec3::new(0.0, -0.7, -0.8), DVec3::new(0.6, 0.7, 0.55)];
+    let region = OrientedBox { rotation, bounds: [low, high].map(|corner| rotation.transpose() * CENTRE + corner) };
+    let config = SurfaceConfig { region: Some(region), iso_value: Some(1.0), ..CONFIG };
+    for preset in [Preset::Voxel, Preset::Small] {
+        let ColoredMesh { mesh, normals, .. } = surface(&model(&[(CENTRE, RADIUS)], preset), &config).colored_mesh;
+        let half = 2.0 / 3.0 * PI * RADIUS.powi(3);
+        assert!(mesh.is_closed() && (mesh.volume() / half - 1.0).abs() < 0.015, "{} {half}", mesh.volume());
+        for (place, normal) in mesh.positions.iter().zip(&normals) {
+            let [local, normal] = [*place - CENTRE, *normal].map(|vector| rotation.transpose() * vector);
+            assert!(local.x > -0.01 && local.length() < RADIUS + 0.01, "{local}");
+            assert!(local.x < 0.1 || normal.dot(local.normalize()) > 0.95, "{local} {normal}");
+        }
+    }
+    let cloud = ball().point_cloud(&cameras(), 500, Some(region), &mut |_, _| ()).unwrap().colored_mesh;
+    assert!(cloud.mesh.positions.len() > 300);
+    for (place, normal) in cloud.mesh.positions.iter().zip(&cloud.normals) {
+        let local = rotation.transpose() * (place - CENTRE);
+        assert!(local.x > -1e-9, "{local}");
+        assert!(local.x < 0.1 || normal.dot((place - CENTRE).normalize()) > 0.95, "{local} {normal}");
+    }
+    // In a capture's coordinates.
+    let transform = crate::dataset::SceneTransform { rotation, scale: 2.0, origin: DVec3::new(5.0, 6.0, 7.0) };
+    let corners = [DVec3::new(4.0, 6.5, 7.0), DVec3::new(6.0, 8.0, 9.0)];
+    let found = OrientedBox::in_capture(&transform, corners).corners();
+    assert!(found[0].distance(transform.point(corners[0])) < 1e-12);
+    assert!(found[7].distance(transform.point(corners[1])) < 1e-12);
+    assert!(found[1].distance(transform.point(DVec3::new(6.0, 6.5, 7.0))) < 1e-12);
+}
+
+#[test]
+fn surface_beyond_the_scene_box_needs_an_unbounded_scene() {
+    // The ball is beside the scene box, which reaches to 1.
+    let bounds = [DVec3::NEG_ONE, DVec3::ONE];
+    let mut config = Config::preset(Preset::Instant);
+    config.unbounded = true;
+    let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
+    (sampler.occupancy.resolution, sampler.occupancy.cascades) = (32, 2);
+    let mut open = Model::new(config, SceneBox::new(bounds, [0.1, 100.0]), 0).unwrap();
+    open.field = Arc::new(Balls(vec![(DVec3::new(1.6, 0.0, 0.0), 0.3)]));
+    open.finish();
+    let config = SurfaceConfig { iso_value: Some(1.0), ..CONFIG };
+    let find = |model: &Model<f32>, config: &SurfaceConfig| {
+        model.surface(&[], config, &mut |_, _| ()).map(|found| found.colored_mesh.mesh)
+    };
+    assert!(find(&open, &config).is_err());
+    let region = [DVec3::new(1.2, -0.5, -0.5), DVec3::new(3.0, 0.5, 0.5)];
+    let beside = SurfaceConfig { region: Some(region.into()), ..config };
+    let mesh = find(&open, &beside).unwrap();
+    assert!(mesh.is_closed() && (mesh.volume() / (4.0 / 3.0 * PI * 0.027) - 1.0).abs() < 0.02, "{}", mesh.volume());
+    let bounded = model_in(bounds, &[(DVec3::new(1.6, 0.0, 0.0), 0.3)], Preset::Voxel);
+    assert!(find(&bounded, &beside).is_err());
+}
+
+#[test]
 fn density_outside_of_the_box_is_zero() {
     let model = model(&[(DVec3::new(1.5, 0.2, 0.0), RADIUS)], Preset::Voxel);
     let mut found = [f32::NAN; 3];
-    Probe::new(&model).shown(None, None, &[[1.49, 0.2, 0.0], [1.51, 0.2, 0.0], [1.2, 0.2, 0.0]], &mut found);
+    Probe::new(&model, None).shown(None, None, &[[1.49, 0.2, 0.0], [1.51, 0.2, 0.0], [1.2, 0.2, 0.0]], &mut found);
     assert!(found[0] > 1e6 && found[1] == 0.0 && found[2] > 100.0, "{found:?}");
 }
