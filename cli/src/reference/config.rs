@@ -356,7 +356,7 @@ fn type_words(sources: &Sources, ty: &str) -> String {
         "usize" | "u32" | "u64" => "integer".into(),
         "f64" | "f32" | "Duration" => "number".into(),
         "bool" => "true or false".into(),
-        "String" => "text".into(),
+        "String" | "HoldOut" => "text".into(),
         "PathBuf" => "path".into(),
         "DVec3" => "3 numbers".into(),
         "DMat3" => "9 numbers".into(),

@@ -3,7 +3,7 @@
 use super::capture::{Capture, View};
 use super::frames::Split;
 use crate::error::{Error, Result};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 use std::str::FromStr;
 
@@ -20,8 +20,7 @@ use std::str::FromStr;
 /// assert_eq!("a.jpg,b.jpg".parse::<HoldOut>()?, HoldOut::Images(vec!["a.jpg".into(), "b.jpg".into()]));
 /// # Ok::<(), raygrad_nerf::Error>(())
 /// ```
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub enum HoldOut {
     /// No image.
     None,
@@ -41,9 +40,15 @@ impl fmt::Display for HoldOut {
     }
 }
 
-impl From<HoldOut> for String {
-    fn from(chosen: HoldOut) -> Self {
-        chosen.to_string()
+impl Serialize for HoldOut {
+    fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for HoldOut {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 
@@ -64,14 +69,6 @@ impl FromStr for HoldOut {
             true => Err(wrong("use none, every:N or names of images separated by commas")),
             false => Ok(HoldOut::Images(names)),
         }
-    }
-}
-
-impl TryFrom<String> for HoldOut {
-    type Error = Error;
-
-    fn try_from(text: String) -> Result<Self> {
-        text.parse()
     }
 }
 
