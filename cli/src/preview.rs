@@ -25,8 +25,9 @@ impl Preview {
     /// Chooses a held-out image: of the validation split or else of the test split. Without held-out images, uses a
     /// training image.
     pub fn choose(scene: &Opened, downscale: usize, train: &Dataset, background: [f32; 3]) -> Self {
-        let held_out = scene.load(Split::Val, downscale, 1);
-        let held_out = held_out.or_else(|error| scene.load(Split::Test, downscale, 1).map_err(|_| error));
+        // Absent images of these splits are reported when they are evaluated.
+        let held_out = scene.load_quietly(Split::Val, downscale, 1);
+        let held_out = held_out.or_else(|error| scene.load_quietly(Split::Test, downscale, 1).map_err(|_| error));
         match held_out {
             Ok(data) => Self::new(&data.frames[0], None, background),
             Err(error) => {

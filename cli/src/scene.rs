@@ -140,7 +140,16 @@ impl Opened {
 
     /// Loads at most `views` evenly spaced images of a split at `1 / downscale` of their size. Warns of absent images.
     pub fn load(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
-        let data = match &self.capture {
+        let data = self.load_quietly(split, downscale, views)?;
+        if let Some(what) = missing(&data.skipped, data.frames.len()) {
+            complain(&format!("warning: {}: {what}", self.scene));
+        }
+        Ok(data)
+    }
+
+    /// [`load`](Self::load) without a warning.
+    pub fn load_quietly(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
+        match &self.capture {
             None => {
                 let data = match self.scene {
                     Scene::Landscape => {
@@ -158,11 +167,11 @@ impl Opened {
                         embedded(split, EMBEDDED_SIZE / downscale)
                     }
                 };
-                Dataset {
+                Ok(Dataset {
                     frames: evenly_spaced(data.frames, views),
                     scene_type: self.asked.unwrap_or(data.scene_type),
                     ..data
-                }
+                })
             }
             Some((capture, analysis)) => {
                 let (progress, words) = (Progress::new(), format!("{split} images read"));
@@ -179,13 +188,9 @@ impl Opened {
                         memory: None,
                         progress: &show,
                     },
-                )?
+                )
             }
-        };
-        if let Some(what) = missing(&data.skipped, data.frames.len()) {
-            complain(&format!("warning: {}: {what}", self.scene));
         }
-        Ok(data)
     }
 }
 
