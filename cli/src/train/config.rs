@@ -34,7 +34,7 @@ impl Args {
         if let Some((name, value)) = self.set.iter().find(is_proposal) {
             config = changed(&config, name, value)?;
         }
-        config = config.with_scene_type(data.scene_type);
+        config = config.with_scene_type(data.scene_type).with_images(data.frames.len());
         if let Some(carve) = self.carve {
             let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
                 let what = format!("the preset {} has no occupancy grid to carve: add --skip fast", self.preset);

@@ -49,6 +49,12 @@ const CAMERA_WARMUP: f64 = 0.1;
 /// The share of a run over which detail is enabled while poses are learned.
 const COARSE: f64 = 0.4;
 
+/// The most images that count as few; the share of a run over which detail is enabled then, and the weight of the
+/// distortion loss.
+const FEW_IMAGES: usize = 16;
+const FEW_IMAGES_COARSE: f64 = 0.5;
+const FEW_IMAGES_DISTORTION: f64 = 0.02;
+
 /// A named configuration, for [`Config::preset`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -299,6 +305,22 @@ impl Config {
         self
     }
 
+    /// Adapts the configuration to the number of training images.
+    ///
+    /// Up to 16 images leave much of a scene to chance. Detail then fades in over the first half of the run, from coarse
+    /// to fine (Yang et al. 2023, "FreeNeRF"), and a bounded scene gets a weak [distortion loss](DistortionConfig)
+    /// against floaters. Figures are in docs/benchmarks/results.md, section Few images.
+    pub fn with_images(mut self, count: usize) -> Self {
+        if count > FEW_IMAGES {
+            return self;
+        }
+        self.camera_optimizer.coarse = FEW_IMAGES_COARSE;
+        if self.loss_terms.iter().all(|term| term.get::<DistortionConfig>().is_none()) {
+            self.loss_terms.push(LossTermConfig::new(DistortionConfig { weight: FEW_IMAGES_DISTORTION }));
+        }
+        self
+    }
+
     /// Enables refinement of these camera parameters, at learning rates found with `examples/refine.rs`. With
     /// [`RefinedParam::Poses`], detail is enabled from coarse to fine.
     pub fn with_refined(mut self, parts: &[RefinedParam]) -> Self {
@@ -478,6 +500,19 @@ mod tests {
         assert_eq!(made(6.5e8, 100.0), (19, 200, 2 * samples, Some(1.0 / 150.0)));
         // Presets without a grid do not change.
         assert_eq!(Config::preset(Preset::Classic).for_budget(1e9, 50.0), Config::preset(Preset::Classic));
+    }
+
+    #[test]
+    fn few_images_get_detail_late_and_a_distortion_loss() {
+        let preset = Config::preset(Preset::Instant);
+        let weight = |config: &Config| config.loss_terms[0].get::<DistortionConfig>().unwrap().weight;
+        let few = preset.clone().with_images(16);
+        few.check().unwrap();
+        assert_eq!((few.camera_optimizer.coarse, few.loss_terms.len(), weight(&few)), (0.5, 1, 0.02));
+        assert_eq!(preset.clone().with_images(17), preset);
+        // The weight of an unbounded scene stays.
+        let unbounded = preset.with_scene_type(SceneType::Unbounded).with_images(3);
+        assert_eq!((unbounded.loss_terms.len(), weight(&unbounded)), (1, 0.1));
     }
 
     #[test]
