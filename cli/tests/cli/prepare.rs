@@ -1,8 +1,10 @@
 //! `raygrad prepare` on videos and images, with scripts instead of ffmpeg and COLMAP.
 
+use super::render::has_ffmpeg;
 use super::{CLASSIC, Place, complained, complained_of, wait};
 use raygrad::nerf::Image;
 use raygrad::nerf::dataset::Photo;
+use raygrad_test_support::skip::skipped;
 use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -107,6 +109,113 @@ fn command(place: &Place, arguments: &str) -> Command {
 
 fn run(place: &Place, arguments: &str) -> Output {
     command(place, arguments).output().unwrap()
+}
+
+/// Blocks of these colours from left to right, as raw RGB.
+const BLOCKS: [[u8; 3]; 8] = [
+    [255, 0, 0],
+    [0, 255, 0],
+    [0, 0, 255],
+    [255, 255, 255],
+    [0, 0, 0],
+    [32, 176, 64],
+    [200, 90, 30],
+    [128, 128, 128],
+];
+
+/// Encodes a second of [`BLOCKS`] without loss to `name`, through ffmpeg filters, with tags of the stream.
+fn record(place: &Place, name: &str, [width, height]: [usize; 2], filters: &str, tags: &str) {
+    let pixel = |i: usize| BLOCKS[i % width * BLOCKS.len() / width];
+    let frame: Vec<u8> = (0..width * height).flat_map(pixel).collect();
+    std::fs::write(place.path("raw"), frame.repeat(3)).unwrap();
+    let size = format!("{width}x{height}");
+    let mut ffmpeg = Command::new("ffmpeg");
+    ffmpeg.args(["-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-r", "3", "-s", &size, "-i"]);
+    ffmpeg.arg(place.path("raw")).args(["-vf", filters, "-c:v", "ffv1"]);
+    let output = ffmpeg.args(tags.split_whitespace()).arg(place.path(name)).output().unwrap();
+    assert!(output.status.success(), "{name}: {output:?}");
+}
+
+/// The largest error of a block's middle in the frames that `prepare` takes from a video, of 255.
+fn color_error(place: &Place, name: &str, blocks: &[usize]) -> f32 {
+    let output = command(place, &format!("prepare {name} --out made --frames 3")).output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let frame = Photo::open(place.path("made/images/frame_00001.jpg"), None).unwrap();
+    std::fs::remove_dir_all(place.path("made")).unwrap();
+    let error = |block: usize| {
+        let seen = frame.pixel((2 * block + 1) * frame.width / (2 * BLOCKS.len()), frame.height / 2);
+        let apart = BLOCKS[block].iter().zip(seen).map(|(own, seen)| (255.0 * seen - f32::from(*own)).abs());
+        apart.fold(0.0, f32::max)
+    };
+    blocks.iter().map(|block| error(*block)).fold(0.0, f32::max)
+}
+
+/// A place whose ffmpeg is the real one.
+fn place_with_ffmpeg() -> Place {
+    let (place, folders) = (place(), std::env::var_os("PATH").unwrap());
+    let real = std::env::split_paths(&folders).map(|folder| folder.join("ffmpeg")).find(|path| path.exists());
+    std::fs::remove_file(place.path("bin/ffmpeg")).unwrap();
+    std::os::unix::fs::symlink(real.unwrap(), place.path("bin/ffmpeg")).unwrap();
+    place
+}
+
+#[test]
+fn frames_keep_the_colours_of_a_video() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let place = place_with_ffmpeg();
+    let all: Vec<usize> = (0..BLOCKS.len()).collect();
+    let yuv = |matrix: &str, range: &str| format!("scale=out_color_matrix={matrix}:out_range={range},format=yuv444p");
+    for (name, size, filters, tags) in [
+        ("709.mkv", [1280, 720], yuv("bt709", "tv"), "-colorspace bt709 -color_primaries bt709 -color_trc bt709"),
+        ("small-709.mkv", [320, 240], yuv("bt709", "tv"), "-colorspace bt709"),
+        ("full-709.mkv", [320, 240], yuv("bt709", "full"), "-colorspace bt709 -color_range pc"),
+        ("untagged.mkv", [1280, 720], yuv("bt709", "tv"), "-colorspace unknown"),
+        ("601.mkv", [1280, 720], yuv("bt601", "tv"), "-colorspace smpte170m"),
+        ("small.mkv", [320, 240], yuv("bt601", "tv"), "-colorspace unknown"),
+        ("2020.mkv", [320, 240], yuv("bt2020", "tv"), "-colorspace bt2020nc"),
+    ] {
+        record(&place, name, size, &filters, tags);
+        let error = color_error(&place, name, &all);
+        assert!(error <= 3.0, "{name}: {error}");
+    }
+}
+
+#[test]
+fn hdr_frames_become_srgb() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let filters = Command::new("ffmpeg").args(["-hide_banner", "-filters"]).output().unwrap().stdout;
+    if !String::from_utf8_lossy(&filters).contains(" zscale ") {
+        return skipped("ffmpeg has no filter zscale");
+    }
+    let place = place_with_ffmpeg();
+    for transfer in ["arib-std-b67", "smpte2084"] {
+        let filters = format!(
+            "zscale=tin=iec61966-2-1:pin=bt709:min=gbr:rin=full:npl=203:t={transfer}:p=bt2020:m=bt2020nc:r=tv,\
+             format=yuv444p10le"
+        );
+        let tags = format!("-colorspace bt2020nc -color_primaries bt2020 -color_trc {transfer}");
+        record(&place, "hdr.mkv", [320, 240], &filters, &tags);
+        // Colours that tone mapping keeps: black and the mixed ones.
+        let error = color_error(&place, "hdr.mkv", &[4, 5, 7]);
+        assert!(error <= 5.0, "{transfer}: {error}");
+        std::fs::remove_file(place.path("hdr.mkv")).unwrap();
+    }
+}
+
+/// The script in place of ffmpeg has no filters.
+#[test]
+fn hdr_without_tone_mapping_gives_a_warning() {
+    let place = place();
+    let hdr = FFMPEG.replace("yuv420p", "yuv420p10le(tv, bt2020nc/bt2020/arib-std-b67)");
+    std::fs::write(place.path("bin/ffmpeg"), hdr).unwrap();
+    let output = run(&place, "prepare walk.mp4 --out made --frames 10");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("warning: the video is HDR (HLG): this ffmpeg lacks"), "{said}");
+    assert!(ran(&place, &["-vf fps=3.000000,scale=", "in_color_matrix=bt2020"]), "{}", log(&place));
 }
 
 /// Names that ffmpeg would take for a protocol, an option or a pattern; and an end of frames, whatever the file says.
