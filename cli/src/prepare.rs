@@ -1,7 +1,10 @@
 //! `raygrad prepare`: makes a dataset from a video, images, or another dataset.
 
 mod bounds;
+mod cameras;
 pub mod convert;
+mod exif;
+mod pairs;
 mod photographs;
 mod poses;
 pub mod program;

@@ -36,6 +36,13 @@ echo progress=end
 const COLMAP: &str = r#"#!/bin/sh
 echo "colmap $*" >> "$LOG"
 case "$*" in "-h"|*" -h") echo "  --$GPU.use_gpu arg (=1)"; exit 0 ;; esac
+previous=
+for argument; do
+  case "$previous" in
+    --image_list_path|--match_list_path) while read -r line; do echo "list $line" >> "$LOG"; done < "$argument" ;;
+  esac
+  previous=$argument
+done
 if [ "$1" = "$FAILS" ]; then echo "Processed file [1/3]"; echo "elapsed"; echo "out of luck" >&2; exit 3; fi
 if [ "$1" = "$SLEEPS" ]; then echo "begun $$" >> "$LOG"; exec sleep 60; fi
 if [ "$1" = feature_extractor ]; then : > "$3"; echo "Processed file [1/10]"; fi
@@ -90,14 +97,28 @@ pub fn place() -> Place {
 
 /// A JPEG of 16 x 8 pixels with stripes and an EXIF orientation.
 fn jpeg(period: usize, orientation: u8) -> Vec<u8> {
+    let mut exif = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
+    exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
+    jpeg_with(period, &exif)
+}
+
+/// The same with a focal length in millimetres of a 35 mm camera.
+fn jpeg_of_lens(focal: u8) -> Vec<u8> {
+    let mut exif = b"MM\0*\0\0\0\x08\0\x01\x87\x69\0\x04\0\0\0\x01\0\0\0\x1a\0\0\0\0".to_vec();
+    exif.extend(b"\0\x01\xa4\x05\0\x03\0\0\0\x01\0");
+    exif.extend([focal, 0, 0, 0, 0, 0, 0]);
+    jpeg_with(4, &exif)
+}
+
+/// A JPEG of 16 x 8 pixels with stripes and EXIF data.
+fn jpeg_with(period: usize, exif: &[u8]) -> Vec<u8> {
     let file = tempfile::Builder::new().suffix(".jpg").tempfile().unwrap();
     let stripe = |x: usize| if x % period < period / 2 { 1.0 } else { 0.0 };
     let data = (0..16 * 8).flat_map(|i| [stripe(i % 16); 3]).collect();
     Photo::from(Image { width: 16, height: 8, channels: 3, data }).save(file.path()).unwrap();
     let plain = std::fs::read(file.path()).unwrap();
-    let mut exif = b"\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
-    exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
-    [&plain[..2], &exif, &plain[2..]].concat()
+    let size = (8 + exif.len() as u16).to_be_bytes();
+    [&plain[..2], b"\xff\xe1", &size, b"Exif\0\0", exif, &plain[2..]].concat()
 }
 
 fn command(place: &Place, arguments: &str) -> Command {
@@ -112,16 +133,8 @@ fn run(place: &Place, arguments: &str) -> Output {
 }
 
 /// Blocks of these colours from left to right, as raw RGB.
-const BLOCKS: [[u8; 3]; 8] = [
-    [255, 0, 0],
-    [0, 255, 0],
-    [0, 0, 255],
-    [255, 255, 255],
-    [0, 0, 0],
-    [32, 176, 64],
-    [200, 90, 30],
-    [128, 128, 128],
-];
+const BLOCKS: [[u8; 3]; 8] =
+    [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255], [0, 0, 0], [32, 176, 64], [200, 90, 30], [128, 128, 128]];
 
 /// Encodes a second of [`BLOCKS`] without loss to `name`, through ffmpeg filters, with tags of the stream.
 fn record(place: &Place, name: &str, [width, height]: [usize; 2], filters: &str, tags: &str) {
@@ -461,19 +474,83 @@ fn bad_inputs_are_named() {
     }
 }
 
+/// A folder with so many images.
+fn many(place: &Place, count: usize) -> String {
+    let (name, photo) = (format!("many-{count}"), jpeg(4, 1));
+    std::fs::create_dir(place.path(&name)).unwrap();
+    (0..count).for_each(|i| std::fs::write(place.path(&format!("{name}/{i:03}.jpg")), &photo).unwrap());
+    name
+}
+
 #[test]
-fn many_images_are_matched_in_sequence() {
+fn many_images_are_matched_in_sequence_and_by_likeness() {
     let place = place();
-    let photo = std::fs::read(place.path("photos/0.JPG")).unwrap();
-    for (count, matcher, said) in [(200, "exhaustive_matcher", false), (201, "sequential_matcher", true)] {
-        let folder = place.path(&format!("many-{count}"));
-        std::fs::create_dir(&folder).unwrap();
-        (0..count).for_each(|i| std::fs::write(folder.join(format!("{i:03}.jpg")), &photo).unwrap());
-        let output = run(&place, &format!("prepare many-{count} --out made-{count}"));
-        assert!(output.status.success(), "{output:?}");
+    for (count, matcher, others) in [(200, "exhaustive_matcher", false), (201, "sequential_matcher", true)] {
+        let _ = std::fs::remove_file(place.path("log"));
+        let name = many(&place, count);
+        if others {
+            std::fs::rename(place.path(&format!("{name}/200.jpg")), place.path(&format!("{name}/2 00.jpg"))).unwrap();
+        }
+        let output = run(&place, &format!("prepare {name} --out made-{count}"));
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{said}");
         assert!(ran(&place, &[matcher, "--database_path", &format!("made-{count}")]), "{}", log(&place));
-        let noted = String::from_utf8_lossy(&output.stderr).contains("only with those that follow by name");
-        assert_eq!(noted, said);
+        let importer = ["matches_importer", "--match_list_path", "pairs.txt", "--match_type pairs"];
+        assert_eq!(ran(&place, &importer), others);
+        // All images are the same, so that each has pairs; not those that the sequential matcher has.
+        let pairs = log(&place).lines().filter(|line| line.starts_with("list ")).count();
+        assert_eq!(pairs > 1000, others, "{pairs}");
+        assert!(!log(&place).contains("list 000.jpg 001.jpg") && !log(&place).contains("2 00.jpg"));
+        assert_eq!(said.contains("1 images have spaces in their names"), others, "{said}");
+    }
+}
+
+#[test]
+fn lenses_have_a_camera_each() {
+    let place = place();
+    for (i, focal) in [26, 13, 26, 13, 77].into_iter().enumerate() {
+        std::fs::write(place.path(&format!("photos/{i}.JPG")), jpeg_of_lens(focal)).unwrap();
+    }
+    let output = run(&place, "prepare photos --out made");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("5 images have 3 combinations of lens and size"), "{said}");
+    let log = log(&place);
+    let parts: Vec<&str> = log.split("colmap feature_extractor --database").skip(1).collect();
+    let lists = parts.iter().map(|part| part.lines().filter(|line| line.starts_with("list ")).collect::<Vec<_>>());
+    assert_eq!(
+        lists.collect::<Vec<_>>(),
+        [vec!["list 0.JPG", "list 2.JPG"], vec!["list 1.JPG", "list 3.JPG"], vec!["list 4.JPG"]]
+    );
+    let shares = parts.iter().map(|part| part.contains("--ImageReader.single_camera 1"));
+    assert_eq!(shares.collect::<Vec<_>>(), [true, true, false]);
+    // With one lens there is one camera and no list.
+    (0..5).for_each(|i| std::fs::write(place.path(&format!("photos/{i}.JPG")), jpeg_of_lens(26)).unwrap());
+    std::fs::remove_file(place.path("log")).unwrap();
+    succeeds(&place, "prepare photos --out again");
+    assert!(ran(&place, &["feature_extractor", "--ImageReader.single_camera 1"]));
+    assert!(!self::log(&place).contains("image_list_path"));
+}
+
+#[test]
+fn glomap_finds_the_poses_of_many_images() {
+    let place = place();
+    let script = COLMAP.replace("echo \"colmap ", "echo \"glomap ");
+    std::fs::write(place.path("bin/glomap"), script).unwrap();
+    std::fs::set_permissions(place.path("bin/glomap"), std::fs::Permissions::from_mode(0o755)).unwrap();
+    for (count, used, models) in [(200, "colmap", "work/models"), (201, "glomap", "work/global")] {
+        let _ = std::fs::remove_file(place.path("log"));
+        let name = many(&place, count);
+        succeeds(&place, &format!("prepare {name} --out made-{count}"));
+        let mappers = log(&place).lines().filter(|line| line.contains(" mapper ")).count();
+        assert!(ran(&place, &[used, " mapper --database_path", models]) && mappers == 1, "{}", log(&place));
+        assert!(place.path(&format!("made-{count}/sparse/0/cameras.txt")).exists());
+    }
+    // It fails, or finds nothing.
+    for (i, script) in ["#!/bin/sh\nexit 1\n", "#!/bin/sh\nexit 0\n"].into_iter().enumerate() {
+        std::fs::write(place.path("bin/glomap"), script).unwrap();
+        let output = run(&place, &format!("prepare many-201 --out fails-{i}"));
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && said.contains("GLOMAP found no poses: COLMAP tries it\n"), "{said}");
     }
 }
 
