@@ -6,8 +6,7 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::Error;
 use raygrad::nerf::dataset::Photo;
 
-use super::photographs::decoding_memory;
-
+use super::photographs::{decoding_memory, ends};
 use super::program::{FFMPEG, file_url};
 use super::workplace::Workplace;
 use crate::interrupt::Work;
@@ -19,6 +18,8 @@ const CANDIDATES: usize = 3;
 /// Temporary folder of the candidates.
 const FOLDER: &str = "candidates";
 
+/// File extensions of videos.
+const ENDINGS: [&str; 8] = ["mp4", "mov", "m4v", "mkv", "webm", "avi", "3gp", "mts"];
 /// Matrices from RGB to YUV: their tags in ffmpeg's output, and their names in its filter `scale`.
 const MATRICES: [(&str, &str); 7] = [
     ("bt709", "bt709"),
@@ -45,6 +46,11 @@ struct Video {
     matrix: &'static str,
     /// Entry of [`HDR`].
     hdr: Option<(&'static str, &'static str)>,
+}
+
+/// Returns true if a file has the name of a video.
+pub fn is_video(file: &Path) -> bool {
+    ends(file, &ENDINGS)
 }
 
 /// Writes about `count` sharp frames of a video to `images`. Of each three consecutive candidates, the sharpest is

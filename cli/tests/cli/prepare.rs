@@ -554,6 +554,78 @@ fn glomap_finds_the_poses_of_many_images() {
     }
 }
 
+/// Options of training runs on the cameras of the script in place of COLMAP.
+const TRAIN: &str = "--scene-type bounded";
+
+#[test]
+fn train_prepares_images_and_videos_once() {
+    let place = place();
+    for (input, about) in [("photos", "5 images from photos"), ("walk.mp4", "30 sharp frames from walk.mp4")] {
+        let train = format!("train {input} {TRAIN} --steps 1 {CLASSIC} --out run-{input}");
+        let said = succeeds(&place, &train);
+        let line = format!("prepare  {input} has no camera poses: making {input}-prepared with COLMAP\n");
+        assert!(said.starts_with(&line) && said.contains(about) && said.contains(" images registered"), "{said}");
+        let made = place.path(&format!("{input}-prepared")).canonicalize().unwrap();
+        assert_eq!(place.json(&format!("run-{input}/config.json"))["scene"]["folder"], made.to_str().unwrap());
+        // The next run uses the same dataset.
+        std::fs::remove_file(place.path("log")).unwrap();
+        let said = succeeds(&place, &train.replace("--out run", "--out again"));
+        assert!(said.starts_with(&format!("prepared {input}-prepared, made before from {input}\n")), "{said}");
+        assert!(!place.path("log").exists() || !log(&place).contains("mapper"));
+    }
+    // Other images than before, and a folder of something else.
+    let train = format!("train photos {TRAIN} --steps 1 {CLASSIC}");
+    std::fs::write(place.path("photos/new.jpg"), jpeg(4, 1)).unwrap();
+    let refused = "photos-prepared: was not made from photos: remove or rename it";
+    complained("new image", &run(&place, &train), &[refused]);
+    std::fs::remove_dir_all(place.path("photos-prepared")).unwrap();
+    std::fs::create_dir(place.path("photos-prepared")).unwrap();
+    std::fs::write(place.path("photos-prepared/notes.txt"), "mine").unwrap();
+    let output = run(&place, &train);
+    assert!(String::from_utf8_lossy(&output.stderr).contains(refused), "{output:?}");
+    assert_eq!(place.bytes("photos-prepared/notes.txt"), b"mine");
+}
+
+#[test]
+fn train_without_colmap_names_other_ways() {
+    let place = place();
+    let output = command(&place, "train photos").env("PATH", place.path("photos")).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    let lines: Vec<&str> = said.lines().collect();
+    assert!(output.status.code() == Some(1) && lines.len() == 2, "{said}");
+    assert!(lines[0].contains("photos: has no camera poses") && lines[0].contains("Polycam or Record3D"), "{said}");
+    assert!(lines[1].contains("`colmap`: is not on the PATH; install it with `apt install colmap`"), "{said}");
+    assert!(!place.path("photos-prepared").exists());
+}
+
+#[test]
+fn train_prepares_no_folder_that_has_cameras() {
+    let place = place();
+    succeeds(&place, "prepare photos --out made");
+    std::fs::remove_file(place.path("log")).unwrap();
+    complained("inner", &run(&place, "train made/images"), &["is not a dataset, but `made` is"]);
+    std::fs::create_dir_all(place.path("photos/keyframes")).unwrap();
+    complained("export", &run(&place, "train photos"), &["is a raw export of Polycam"]);
+    std::fs::create_dir(place.path("empty")).unwrap();
+    complained("empty", &run(&place, "train empty"), &["is not a dataset: expected transforms.json"]);
+    complained("image", &run(&place, "train sharp.jpg"), &["sharp.jpg: does not describe a capture"]);
+    assert!(!place.path("log").exists());
+}
+
+#[test]
+fn ctrl_c_after_preparing_saves_the_model() {
+    let place = place();
+    let mut command = command(&place, &format!("train photos {TRAIN} --budget 1h {CLASSIC} --out run"));
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    wait(&mut child, || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0));
+    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(sent.success());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{output:?}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("stopped "), "{output:?}");
+    assert!(String::from_utf8_lossy(&output.stderr).contains("stopping after this step"), "{output:?}");
+}
+
 #[test]
 fn linked_images_are_copied_if_allowed() {
     use std::os::unix::fs::symlink;
