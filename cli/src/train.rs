@@ -68,7 +68,7 @@ const NEW: [&str; 18] = [
 /// Example: raygrad train my-scene --downscale 4 --budget 10m --out my-run
 #[derive(Parser)]
 pub struct Args {
-    /// Capture folder, image folder, video, or a built-in scene
+    /// Capture, image folder, video or built-in scene
     ///
     /// Built-in scenes: embedded and landscape.
     ///
