@@ -9,7 +9,7 @@ use raygrad::nerf::dataset::Capture;
 
 use super::workplace::others;
 use super::{Glass, Input, make, photographs, poses, video};
-use crate::interrupt::{self, Stop, Work};
+use crate::interrupt::{self, Work};
 use crate::output::{complain, entries, print};
 
 /// End of the folder's name.
@@ -39,13 +39,12 @@ pub fn dataset(input: &Path) -> Work<PathBuf> {
         print(&format!("prepared {}, made before from {}\n", out.display(), input.display()))?;
         return Ok(out);
     }
-    if let Err(stop) = poses::check() {
-        if matches!(stop, Stop::Failed(_)) {
-            complain(&format!("{}: {WITHOUT}", input.display()));
-        }
-        return Err(stop);
+    if poses::check().is_err() {
+        // The error says how to install it.
+        complain(&format!("{}: {WITHOUT}", input.display()));
+    } else {
+        print(&format!("prepare  {} has no camera poses: making {} with COLMAP\n", input.display(), out.display()))?;
     }
-    print(&format!("prepare  {} has no camera poses: making {} with COLMAP\n", input.display(), out.display()))?;
     interrupt::listen_to_remove();
     make(&Input { path: input, frames: super::FRAMES, lens: Glass::default(), allow_outside: false }, &out)?;
     interrupt::listen();

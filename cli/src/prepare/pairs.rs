@@ -18,8 +18,8 @@ const NEAREST: usize = 10;
 pub type Descriptor = Vec<f32>;
 
 /// Computes histograms of gradients (Dalal and Triggs 2005) of a grey thumbnail, and their square roots as in RootSIFT
-/// (Arandjelovic and Zisserman 2012). Correlations of thumbnails find a fourth of the pairs in the test below: they
-/// compare the horizon.
+/// (Arandjelovic and Zisserman 2012). Correlation of thumbnails found less than half of the pairs in the test
+/// below: it compares the horizon.
 pub fn describe(photo: &Photo) -> Descriptor {
     let small = photo.resized([photo.width.min(SIDE), photo.height.min(SIDE)]);
     let grey = |x: usize, y: usize| {
