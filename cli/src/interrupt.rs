@@ -1,6 +1,7 @@
 //! Signals. The first Ctrl-C requests a stop, the second ends the program. SIGTERM and SIGHUP only request a stop.
 
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 use raygrad::nerf::Error;
 
@@ -52,9 +53,17 @@ pub fn listen_to_input() {
     });
 }
 
+/// The line for the first Ctrl-C; empty before this program listens.
+static SAID: Mutex<&str> = Mutex::new("");
+
+/// Sets the line for the first Ctrl-C. Listens from the first call on: a second handler would end the program at once.
 fn set(said: &'static str, promise: &str) {
+    let line = || SAID.lock().unwrap_or_else(PoisonError::into_inner);
+    if !std::mem::replace(&mut *line(), said).is_empty() {
+        return;
+    }
     let handler = move |is_ctrl_c: bool| match REQUESTED.swap(true, Ordering::Relaxed) {
-        false => note(said),
+        false => note(*line()),
         // A closed terminal may send SIGHUP more than once, so that only Ctrl-C ends the program.
         true if is_ctrl_c => std::process::exit(EXIT_CODE.into()),
         true => {}

@@ -1,7 +1,11 @@
 //! `raygrad prepare`: makes a dataset from a video, images, or another dataset.
 
+pub mod beside;
 mod bounds;
+mod cameras;
 pub mod convert;
+mod exif;
+mod pairs;
 mod photographs;
 mod poses;
 pub mod program;
@@ -24,6 +28,8 @@ use super::{builtin, doctor, interrupt};
 use convert::Target;
 use workplace::Workplace;
 
+/// Frames to take from a video by default.
+const FRAMES: usize = 120;
 /// Names of images in a message. Further ones are counted.
 const NAMED: usize = 8;
 
@@ -56,7 +62,7 @@ pub struct Args {
     /// Frames to take from a video
     ///
     /// raygrad extracts three times as many and keeps the sharpest.
-    #[arg(long, help_heading = "Scene", value_name = "N", default_value_t = 120, value_parser = parse::count(10_000),
+    #[arg(long, help_heading = "Scene", value_name = "N", default_value_t = FRAMES, value_parser = parse::count(10_000),
           conflicts_with_all = ["to", "undistort"])]
     frames: usize,
     /// perspective or fisheye
@@ -115,7 +121,17 @@ pub fn run(args: &Args) -> Work<()> {
     Ok(())
 }
 
-/// Makes a dataset from a video or images.
+/// A video or images without cameras.
+struct Input<'a> {
+    path: &'a Path,
+    /// Frames to take from a video.
+    frames: usize,
+    lens: Glass,
+    /// Whether links may lead out of a folder of images.
+    allow_outside: bool,
+}
+
+/// Makes a dataset from a video or images, and examines it.
 fn prepare(args: &Args) -> Work<()> {
     let input = &args.input;
     if !matches!(Scene::from(input.clone().into_os_string()), Scene::Folder(_)) {
@@ -125,34 +141,41 @@ fn prepare(args: &Args) -> Work<()> {
     if !input.exists() {
         return Err(Error::file(input, "there is no such file or folder").into());
     }
-    let is_video = input.is_file();
-    if !is_video && Capture::read(input).is_ok() {
+    if !input.is_file() && Capture::read(input).is_ok() {
         let what = "already has camera poses: train on it, or choose a format to convert it to with --to";
         return Err(Error::file(input, what).into());
     }
-    // Checks the input first: a folder without images needs no COLMAP.
-    let images = if is_video { vec![] } else { photographs::find(input)? };
-    if is_video {
-        photographs::check_no_image(input)?;
-        program::FFMPEG.check()?;
-    }
-    poses::check()?;
-    let place = Workplace::new(&args.out)?;
-    let count = match is_video {
-        true => video::frames(input, args.frames, &place)?,
-        false => photographs::copy(input, &images, args.allow_outside, &place)?,
-    };
-    let what = if is_video { "sharp frames from" } else { "images from" };
-    print(&format!("images   {count} {what} {}\n", input.display()))?;
-    let found = poses::find(&place, is_video, args.lens.model())?;
-    place.finish()?;
-    report(&found, count, &args.out)?;
+    let Args { frames, lens, allow_outside, ref out, .. } = *args;
+    make(&Input { path: input, frames, lens, allow_outside }, out)?;
     // The dataset is complete, so errors of the check are only warnings.
-    let (scene, out) = (Scene::Folder(args.out.clone()), args.out.join("doctor"));
+    let (scene, out) = (Scene::Folder(out.clone()), out.join("doctor"));
     if let Err(error) = doctor::run(&doctor::Args { scene, scene_type: None, out, overwrite: false, json: false }) {
         complain(&format!("warning: {error}"));
     }
     Ok(())
+}
+
+/// Makes a dataset in `out`.
+fn make(input: &Input<'_>, out: &Path) -> Work<()> {
+    let Input { path, frames, lens, allow_outside } = *input;
+    let is_video = path.is_file();
+    // Checks the input first: a folder without images needs no COLMAP.
+    let images = if is_video { vec![] } else { photographs::find(path)? };
+    if is_video {
+        photographs::check_no_image(path)?;
+        program::FFMPEG.check()?;
+    }
+    poses::check()?;
+    let place = Workplace::new(out)?;
+    let count = match is_video {
+        true => video::frames(path, frames, &place)?,
+        false => photographs::copy(path, &images, allow_outside, &place)?,
+    };
+    let what = if is_video { "sharp frames from" } else { "images from" };
+    print(&format!("images   {count} {what} {}\n", path.display()))?;
+    let found = poses::find(&place, is_video, lens.model())?;
+    place.finish()?;
+    report(&found, count, out)
 }
 
 fn report(found: &poses::Found, count: usize, out: &Path) -> Work<()> {

@@ -16,8 +16,10 @@ use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Error, Preset, Result, StepStats, Trainer, available_memory};
 use serde_json::Value;
 
+use super::interrupt::Work;
 use super::lock::Lock;
 use super::output::{complain, print};
+use super::prepare::beside;
 use super::preview::Preview;
 use super::progress::spoken;
 use super::run::{CHECKPOINTS, Run, RunConfig, choose_folder};
@@ -66,9 +68,12 @@ const NEW: [&str; 18] = [
 /// Example: raygrad train my-scene --downscale 4 --budget 10m --out my-run
 #[derive(Parser)]
 pub struct Args {
-    /// Capture folder, or a built-in scene
+    /// Capture, image folder, video or built-in scene
     ///
     /// Built-in scenes: embedded and landscape.
+    ///
+    /// A video, or a folder of images without camera poses, is first made into a dataset beside it, as by `raygrad
+    /// prepare`: walk.mp4 becomes walk.mp4-prepared. Later runs reuse that folder.
     ///
     /// raygrad reads transforms.json (nerfstudio, instant-ngp), transforms_train.json (Blender), sparse/0 (COLMAP)
     /// and poses_bounds.npy (LLFF).
@@ -247,22 +252,26 @@ impl Trained {
 }
 
 /// Trains a new run or resumes one.
-pub fn run(args: &Args) -> Result<Trained> {
+pub fn run(args: &Args) -> Work<Trained> {
     if !args.view && args.place.are_given() {
-        return Err(Error::setting("view", "is missing: --host and --port need --view"));
+        return Err(Error::setting("view", "is missing: --host and --port need --view").into());
     }
     // Binds the port first, before files are created.
     let listener = args.view.then(|| args.place.listen()).transpose()?;
     match &args.resume {
         None => begin(args, listener),
-        Some(folder) => resume(args, folder, listener),
+        Some(folder) => Ok(resume(args, folder, listener)?),
     }
 }
 
 /// Trains a new run.
-fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
+fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
-    let source = args.format.map_or_else(|| Ok(args.scene.clone()), |format| args.scene.in_format(format))?;
+    let source = match (&args.scene, args.format) {
+        (scene, Some(format)) => scene.in_format(format)?,
+        (Scene::Folder(input), None) if beside::is_unprepared(input) => Scene::Folder(beside::dataset(input)?),
+        (scene, None) => scene.clone(),
+    };
     let mut scene = source.open(args.scene_type, args.mask_as_alpha, args.test.as_ref())?;
     let downscale = args.downscale.unwrap_or_else(|| scene.automatic_downscale());
     scene.depth = args.has_depth_loss();
@@ -286,7 +295,7 @@ fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
     }
 
     let preview = Preview::choose(&scene, downscale, &data, background);
-    train((run, lock), trainer, args.budget(), args, preview, listener)
+    Ok(train((run, lock), trainer, args.budget(), args, preview, listener)?)
 }
 
 /// Resumes a run from its last checkpoint.

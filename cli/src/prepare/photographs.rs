@@ -36,7 +36,7 @@ pub fn decoding_memory(images: &[PathBuf]) -> Vec<u64> {
 }
 
 /// Returns true if the file name has one of these extensions.
-fn ends(path: &Path, endings: &[&str]) -> bool {
+pub fn ends(path: &Path, endings: &[&str]) -> bool {
     let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
     endings.iter().any(|known| known.eq_ignore_ascii_case(ending))
 }
@@ -47,6 +47,12 @@ pub fn check_no_image(file: &Path) -> Result<()> {
         true => Err(Error::file(file, "is a single image: name the folder that holds the images")),
         false => Ok(()),
     }
+}
+
+/// Returns true if [`find`] finds images in a folder, or some that raygrad cannot read.
+pub fn are_in(folder: &Path) -> bool {
+    let files = [folder, &folder.join("images")].map(std::fs::read_dir).into_iter().flatten().flatten().flatten();
+    files.map(|entry| entry.path()).any(|path| ends(&path, &READ) || ends(&path, &NOT_READ))
 }
 
 /// The images in a folder, unsorted. Warns of images that raygrad cannot read.

@@ -7,14 +7,21 @@ use raygrad::nerf::dataset::formats::colmap;
 use raygrad::nerf::dataset::{Capture, Photo};
 use raygrad::nerf::{Error, Result};
 
-use super::program::{COLMAP, counted};
+use super::cameras::{self, About, Cameras};
+use super::pairs;
+use super::photographs::decoding_memory;
+use super::program::{COLMAP, GLOMAP, Program, counted};
 use super::workplace::Workplace;
-use crate::interrupt::Work;
+use crate::interrupt::{Stop, Work};
 use crate::output::{entries, note};
 use crate::progress::Progress;
 
 /// Up to this number of images, COLMAP matches all pairs. This closes loops of a video.
 const EXHAUSTIVE: usize = 200;
+/// Beyond it, each image is also matched with so many that look alike, no two of them closer by number than this.
+const SIMILAR: [usize; 2] = [20, 0];
+/// The same for frames of a video, which look like those beside them.
+const LOOPS: [usize; 2] = [5, 10];
 /// Temporary folder of COLMAP.
 const FOLDER: &str = "work";
 /// Options that disable the GPU, for new and old versions.
@@ -45,20 +52,16 @@ pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
     let images = place.folder().join("images");
     let names = names(&images)?;
     let work = place.make(FOLDER)?;
-    let colmap = Colmap { database: work.join("database.db"), images };
-
-    let mut arguments = vec!["--ImageReader.camera_model", model];
-    if colmap.one_size(&names)? {
-        // A shared camera has more accurate intrinsics.
-        arguments.extend(["--ImageReader.single_camera", "1"]);
+    let about = names.iter().map(|name| About::read(&images.join(name))).collect::<Result<Vec<About>>>()?;
+    let colmap = Colmap { database: work.join("database.db"), images, work };
+    colmap.extract(&names, &about, model)?;
+    if names.len() <= EXHAUSTIVE {
+        colmap.step("exhaustive_matcher", Some(MATCHING), "matching images", &[])?;
+    } else {
+        colmap.step("sequential_matcher", Some(MATCHING), "matching images that follow", &[])?;
+        colmap.match_similar(&names, &about, sequence)?;
     }
-    colmap.step("feature_extractor", Some(EXTRACTION), "extracting features", &arguments)?;
-    let matcher = if names.len() > EXHAUSTIVE { "sequential_matcher" } else { "exhaustive_matcher" };
-    if names.len() > EXHAUSTIVE && !sequence {
-        note(&format!("more than {EXHAUSTIVE} images: COLMAP matches each only with those that follow by name"));
-    }
-    colmap.step(matcher, Some(MATCHING), "matching images", &[])?;
-    let found = colmap.map(&place.make(&format!("{FOLDER}/models"))?, names.len())?;
+    let found = colmap.map(place, names.len())?;
     let count = found.len();
     // If sizes are equal, the first model is kept.
     let largest = found.into_iter().rev().max_by_key(|(_, capture)| capture.views.len());
@@ -94,23 +97,70 @@ fn folders(models: &Path) -> Result<Vec<PathBuf>> {
 struct Colmap {
     database: PathBuf,
     images: PathBuf,
+    /// Folder for lists.
+    work: PathBuf,
 }
 
 impl Colmap {
-    /// Returns true if all images have one size, which suggests a single camera.
-    fn one_size(&self, names: &[String]) -> Result<bool> {
-        let mut first = None;
-        for name in names {
-            let [_, size] = Photo::size_of_file(self.images.join(name))?;
-            if *first.get_or_insert(size) != size {
-                return Ok(false);
-            }
+    /// Finds features. Images of one lens and size share a camera, whose intrinsics are then more accurate. COLMAP reads
+    /// the focal length from the EXIF data.
+    fn extract(&self, names: &[String], about: &[About], model: &str) -> Work<()> {
+        let Cameras { shared, single } = cameras::group(about);
+        let groups = shared.iter().map(|group| (group, true)).chain(Some((&single, false)));
+        let groups: Vec<_> = groups.filter(|(group, _)| !group.is_empty()).collect();
+        if groups.len() > 1 {
+            let (count, all) = (shared.len() + single.len(), names.len());
+            note(&format!("the {all} images have {count} combinations of lens and size: COLMAP calibrates each alone"));
         }
-        Ok(true)
+        for (number, (group, is_shared)) in groups.iter().enumerate() {
+            let mut arguments = ["--ImageReader.camera_model", model].map(OsStr::new).to_vec();
+            if *is_shared {
+                arguments.extend(["--ImageReader.single_camera", "1"].map(OsStr::new));
+            }
+            let list = self.work.join(format!("camera-{number}.txt"));
+            let part = if groups.len() > 1 { format!(" ({} of {})", number + 1, groups.len()) } else { String::new() };
+            if groups.len() > 1 {
+                let lines: String = group.iter().map(|i| format!("{}\n", names[*i])).collect();
+                write(&list, &lines)?;
+                arguments.extend([OsStr::new("--image_list_path"), list.as_os_str()]);
+            }
+            let words = format!("extracting features{part}");
+            self.step("feature_extractor", Some(EXTRACTION), &words, &arguments)?;
+        }
+        Ok(())
+    }
+
+    /// Matches images that look alike or were taken near each other, as in two loops around an object.
+    fn match_similar(&self, names: &[String], about: &[About], sequence: bool) -> Work<()> {
+        let files: Vec<PathBuf> = names.iter().map(|name| self.images.join(name)).collect();
+        let descriptors = Progress::new().each(&decoding_memory(&files), "images compared", |i| {
+            Ok(pairs::describe(&Photo::open(&files[i], None)?))
+        })?;
+        let places: Vec<_> = about.iter().map(|image| image.place).collect();
+        let [wanted, apart] = if sequence { LOOPS } else { SIMILAR };
+        let found = pairs::find(&descriptors, &places, wanted, apart);
+        // COLMAP's list separates names by spaces, and its comments begin with #.
+        let is_listed = |i: usize| !names[i].contains(char::is_whitespace) && !names[i].starts_with('#');
+        let left_out = (0..names.len()).filter(|i| !is_listed(*i)).count();
+        if left_out > 0 {
+            note(&format!(
+                "{left_out} images have spaces in their names: COLMAP matches them only with those that follow"
+            ));
+        }
+        let found = found.iter().filter(|pair| pair.iter().all(|i| is_listed(*i)));
+        let lines: String = found.map(|[a, b]| format!("{} {}\n", names[*a], names[*b])).collect();
+        if lines.is_empty() {
+            return Ok(());
+        }
+        let list = self.work.join("pairs.txt");
+        write(&list, &lines)?;
+        let [path, kind, pairs] = ["--match_list_path", "--match_type", "pairs"].map(OsStr::new);
+        let arguments = [path, list.as_os_str(), kind, pairs];
+        self.step("matches_importer", Some(MATCHING), "matching images that look alike", &arguments)
     }
 
     /// Runs a COLMAP command that prints its progress as a count.
-    fn step(&self, step: &str, gpu: Option<[&str; 2]>, words: &str, arguments: &[&str]) -> Work<()> {
+    fn step(&self, step: &str, gpu: Option<[&str; 2]>, words: &str, arguments: &[&OsStr]) -> Work<()> {
         let mut command = COLMAP.command();
         command.arg(step).arg("--database_path").arg(&self.database);
         if step == "feature_extractor" {
@@ -129,10 +179,24 @@ impl Colmap {
         })
     }
 
-    /// Runs the mapper and returns its models with their folders. COLMAP prints each registered image and restarts the
-    /// count for each model.
-    fn map(&self, models: &Path, total: usize) -> Work<Vec<(PathBuf, Capture)>> {
-        let mut command = COLMAP.command();
+    /// Finds poses and returns the models with their folders. GLOMAP, if installed, does it for many images: the time of
+    /// COLMAP's mapper grows faster than their number.
+    fn map(&self, place: &Workplace, total: usize) -> Work<Vec<(PathBuf, Capture)>> {
+        if total > EXHAUSTIVE && GLOMAP.check().is_ok() {
+            note(&format!("more than {EXHAUSTIVE} images: GLOMAP finds the poses"));
+            let folder = place.make(&format!("{FOLDER}/global"))?;
+            match self.run_mapper(GLOMAP, &folder, total) {
+                Ok(found) if found.iter().any(|(_, capture)| !capture.views.is_empty()) => return Ok(found),
+                Err(Stop::Interrupted) => return Err(Stop::Interrupted),
+                _ => note("GLOMAP found no poses: COLMAP tries it"),
+            }
+        }
+        self.run_mapper(COLMAP, &place.make(&format!("{FOLDER}/models"))?, total)
+    }
+
+    /// Runs the mapper of a program. COLMAP prints each registered image and restarts the count for each model.
+    fn run_mapper(&self, program: Program, models: &Path, total: usize) -> Work<Vec<(PathBuf, Capture)>> {
+        let mut command = program.command();
         let paths: [(&str, &OsStr); 3] = [
             ("--database_path", self.database.as_os_str()),
             ("--image_path", self.images.as_os_str()),
@@ -144,7 +208,7 @@ impl Colmap {
             command.arg(name).arg(path);
         }
         let progress = Progress::new();
-        COLMAP.run(&mut command, Some(NO_MODEL), |line| {
+        program.run(&mut command, Some(NO_MODEL), |line| {
             let Some(count) = registered(line) else { return };
             most = most.max(count);
             progress.set(most as f64 / total as f64, || match count {
@@ -155,6 +219,11 @@ impl Colmap {
         let folders = folders(models)?.into_iter();
         Ok(folders.map(|folder| Ok((folder.clone(), colmap::read(&folder)?))).collect::<Result<_>>()?)
     }
+}
+
+/// Writes a list for COLMAP.
+fn write(path: &Path, text: &str) -> Result<()> {
+    std::fs::write(path, text).map_err(|e| Error::file(path, format!("cannot be written: {e}")))
 }
 
 /// The count in `Registering image #12 (13)`, or `(num_reg_frames=13)` in newer versions.

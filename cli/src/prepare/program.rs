@@ -41,6 +41,9 @@ pub const COLMAP: Program = Program {
               (winget has none) from github.com/colmap/colmap/releases",
 };
 
+/// Finds camera poses of many images faster.
+pub const GLOMAP: Program = Program { name: "glomap", install: "the instructions at github.com/colmap/glomap" };
+
 impl Program {
     /// Runs a short command and returns its output, whatever its exit code.
     pub fn ask<S: AsRef<std::ffi::OsStr>>(&self, arguments: &[S]) -> Work<String> {

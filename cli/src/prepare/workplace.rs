@@ -93,7 +93,7 @@ impl Workplace {
 const NOTHING: [&str; 2] = ["lost+found", ".DS_Store"];
 
 /// The entries of a folder, except for temporary ones, such as those of a killed program.
-fn others(folder: &Path) -> std::io::Result<Vec<OsString>> {
+pub fn others(folder: &Path) -> std::io::Result<Vec<OsString>> {
     let names = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.file_name()));
     let is_other = |name: &OsString| !(NOTHING.iter().any(|nothing| name == *nothing) || is_scratch(name));
     Ok(names.collect::<std::io::Result<Vec<_>>>()?.into_iter().filter(is_other).collect())

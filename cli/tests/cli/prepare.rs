@@ -1,8 +1,10 @@
 //! `raygrad prepare` on videos and images, with scripts instead of ffmpeg and COLMAP.
 
+use super::render::has_ffmpeg;
 use super::{CLASSIC, Place, complained, complained_of, wait};
 use raygrad::nerf::Image;
 use raygrad::nerf::dataset::Photo;
+use raygrad_test_support::skip::skipped;
 use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -34,6 +36,13 @@ echo progress=end
 const COLMAP: &str = r#"#!/bin/sh
 echo "colmap $*" >> "$LOG"
 case "$*" in "-h"|*" -h") echo "  --$GPU.use_gpu arg (=1)"; exit 0 ;; esac
+previous=
+for argument; do
+  case "$previous" in
+    --image_list_path|--match_list_path) while read -r line; do echo "list $line" >> "$LOG"; done < "$argument" ;;
+  esac
+  previous=$argument
+done
 if [ "$1" = "$FAILS" ]; then echo "Processed file [1/3]"; echo "elapsed"; echo "out of luck" >&2; exit 3; fi
 if [ "$1" = "$SLEEPS" ]; then echo "begun $$" >> "$LOG"; exec sleep 60; fi
 if [ "$1" = feature_extractor ]; then : > "$3"; echo "Processed file [1/10]"; fi
@@ -88,14 +97,28 @@ pub fn place() -> Place {
 
 /// A JPEG of 16 x 8 pixels with stripes and an EXIF orientation.
 fn jpeg(period: usize, orientation: u8) -> Vec<u8> {
+    let mut exif = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
+    exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
+    jpeg_with(period, &exif)
+}
+
+/// The same with a focal length in millimetres of a 35 mm camera.
+fn jpeg_of_lens(focal: u8) -> Vec<u8> {
+    let mut exif = b"MM\0*\0\0\0\x08\0\x01\x87\x69\0\x04\0\0\0\x01\0\0\0\x1a\0\0\0\0".to_vec();
+    exif.extend(b"\0\x01\xa4\x05\0\x03\0\0\0\x01\0");
+    exif.extend([focal, 0, 0, 0, 0, 0, 0]);
+    jpeg_with(4, &exif)
+}
+
+/// A JPEG of 16 x 8 pixels with stripes and EXIF data.
+fn jpeg_with(period: usize, exif: &[u8]) -> Vec<u8> {
     let file = tempfile::Builder::new().suffix(".jpg").tempfile().unwrap();
     let stripe = |x: usize| if x % period < period / 2 { 1.0 } else { 0.0 };
     let data = (0..16 * 8).flat_map(|i| [stripe(i % 16); 3]).collect();
     Photo::from(Image { width: 16, height: 8, channels: 3, data }).save(file.path()).unwrap();
     let plain = std::fs::read(file.path()).unwrap();
-    let mut exif = b"\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
-    exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
-    [&plain[..2], &exif, &plain[2..]].concat()
+    let size = (8 + exif.len() as u16).to_be_bytes();
+    [&plain[..2], b"\xff\xe1", &size, b"Exif\0\0", exif, &plain[2..]].concat()
 }
 
 fn command(place: &Place, arguments: &str) -> Command {
@@ -107,6 +130,105 @@ fn command(place: &Place, arguments: &str) -> Command {
 
 fn run(place: &Place, arguments: &str) -> Output {
     command(place, arguments).output().unwrap()
+}
+
+/// Blocks of these colours from left to right, as raw RGB.
+const BLOCKS: [[u8; 3]; 8] =
+    [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255], [0, 0, 0], [32, 176, 64], [200, 90, 30], [128, 128, 128]];
+
+/// Encodes a second of [`BLOCKS`] without loss to `name`, through ffmpeg filters, with tags of the stream.
+fn record(place: &Place, name: &str, [width, height]: [usize; 2], filters: &str, tags: &str) {
+    let pixel = |i: usize| BLOCKS[i % width * BLOCKS.len() / width];
+    let frame: Vec<u8> = (0..width * height).flat_map(pixel).collect();
+    std::fs::write(place.path("raw"), frame.repeat(3)).unwrap();
+    let size = format!("{width}x{height}");
+    let mut ffmpeg = Command::new("ffmpeg");
+    ffmpeg.args(["-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-r", "3", "-s", &size, "-i"]);
+    ffmpeg.arg(place.path("raw")).args(["-vf", filters, "-c:v", "ffv1"]);
+    let output = ffmpeg.args(tags.split_whitespace()).arg(place.path(name)).output().unwrap();
+    assert!(output.status.success(), "{name}: {output:?}");
+}
+
+/// The largest error of a block's middle in the frames that `prepare` takes from a video, of 255.
+fn color_error(place: &Place, name: &str, blocks: &[usize]) -> f32 {
+    let output = command(place, &format!("prepare {name} --out made --frames 3")).output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let frame = Photo::open(place.path("made/images/frame_00001.jpg"), None).unwrap();
+    std::fs::remove_dir_all(place.path("made")).unwrap();
+    let error = |block: usize| {
+        let seen = frame.pixel((2 * block + 1) * frame.width / (2 * BLOCKS.len()), frame.height / 2);
+        let apart = BLOCKS[block].iter().zip(seen).map(|(own, seen)| (255.0 * seen - f32::from(*own)).abs());
+        apart.fold(0.0, f32::max)
+    };
+    blocks.iter().map(|block| error(*block)).fold(0.0, f32::max)
+}
+
+/// A place whose ffmpeg is the real one.
+fn place_with_ffmpeg() -> Place {
+    let (place, folders) = (place(), std::env::var_os("PATH").unwrap());
+    let real = std::env::split_paths(&folders).map(|folder| folder.join("ffmpeg")).find(|path| path.exists());
+    std::fs::remove_file(place.path("bin/ffmpeg")).unwrap();
+    std::os::unix::fs::symlink(real.unwrap(), place.path("bin/ffmpeg")).unwrap();
+    place
+}
+
+#[test]
+fn frames_keep_the_colours_of_a_video() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let place = place_with_ffmpeg();
+    let all: Vec<usize> = (0..BLOCKS.len()).collect();
+    let yuv = |matrix: &str, range: &str| format!("scale=out_color_matrix={matrix}:out_range={range},format=yuv444p");
+    for (name, size, filters, tags) in [
+        ("709.mkv", [1280, 720], yuv("bt709", "tv"), "-colorspace bt709 -color_primaries bt709 -color_trc bt709"),
+        ("small-709.mkv", [320, 240], yuv("bt709", "tv"), "-colorspace bt709"),
+        ("full-709.mkv", [320, 240], yuv("bt709", "full"), "-colorspace bt709 -color_range pc"),
+        ("untagged.mkv", [1280, 720], yuv("bt709", "tv"), "-colorspace unknown"),
+        ("601.mkv", [1280, 720], yuv("bt601", "tv"), "-colorspace smpte170m"),
+        ("small.mkv", [320, 240], yuv("bt601", "tv"), "-colorspace unknown"),
+        ("2020.mkv", [320, 240], yuv("bt2020", "tv"), "-colorspace bt2020nc"),
+    ] {
+        record(&place, name, size, &filters, tags);
+        let error = color_error(&place, name, &all);
+        assert!(error <= 3.0, "{name}: {error}");
+    }
+}
+
+#[test]
+fn hdr_frames_become_srgb() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let filters = Command::new("ffmpeg").args(["-hide_banner", "-filters"]).output().unwrap().stdout;
+    if !String::from_utf8_lossy(&filters).contains(" zscale ") {
+        return skipped("ffmpeg has no filter zscale");
+    }
+    let place = place_with_ffmpeg();
+    for transfer in ["arib-std-b67", "smpte2084"] {
+        let filters = format!(
+            "zscale=tin=iec61966-2-1:pin=bt709:min=gbr:rin=full:npl=203:t={transfer}:p=bt2020:m=bt2020nc:r=tv,\
+             format=yuv444p10le"
+        );
+        let tags = format!("-colorspace bt2020nc -color_primaries bt2020 -color_trc {transfer}");
+        record(&place, "hdr.mkv", [320, 240], &filters, &tags);
+        // Colours that tone mapping keeps: black and the mixed ones.
+        let error = color_error(&place, "hdr.mkv", &[4, 5, 7]);
+        assert!(error <= 5.0, "{transfer}: {error}");
+        std::fs::remove_file(place.path("hdr.mkv")).unwrap();
+    }
+}
+
+/// The script in place of ffmpeg has no filters.
+#[test]
+fn hdr_without_tone_mapping_gives_a_warning() {
+    let place = place();
+    let hdr = FFMPEG.replace("yuv420p", "yuv420p10le(tv, bt2020nc/bt2020/arib-std-b67)");
+    std::fs::write(place.path("bin/ffmpeg"), hdr).unwrap();
+    let output = run(&place, "prepare walk.mp4 --out made --frames 10");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("warning: the video is HDR (HLG): this ffmpeg lacks"), "{said}");
+    assert!(ran(&place, &["-vf fps=3.000000,scale=", "in_color_matrix=bt2020"]), "{}", log(&place));
 }
 
 /// Names that ffmpeg would take for a protocol, an option or a pattern; and an end of frames, whatever the file says.
@@ -352,20 +474,156 @@ fn bad_inputs_are_named() {
     }
 }
 
+/// A folder with so many images.
+fn many(place: &Place, count: usize) -> String {
+    let (name, photo) = (format!("many-{count}"), jpeg(4, 1));
+    std::fs::create_dir(place.path(&name)).unwrap();
+    (0..count).for_each(|i| std::fs::write(place.path(&format!("{name}/{i:03}.jpg")), &photo).unwrap());
+    name
+}
+
 #[test]
-fn many_images_are_matched_in_sequence() {
+fn many_images_are_matched_in_sequence_and_by_likeness() {
     let place = place();
-    let photo = std::fs::read(place.path("photos/0.JPG")).unwrap();
-    for (count, matcher, said) in [(200, "exhaustive_matcher", false), (201, "sequential_matcher", true)] {
-        let folder = place.path(&format!("many-{count}"));
-        std::fs::create_dir(&folder).unwrap();
-        (0..count).for_each(|i| std::fs::write(folder.join(format!("{i:03}.jpg")), &photo).unwrap());
-        let output = run(&place, &format!("prepare many-{count} --out made-{count}"));
-        assert!(output.status.success(), "{output:?}");
+    for (count, matcher, others) in [(200, "exhaustive_matcher", false), (201, "sequential_matcher", true)] {
+        let _ = std::fs::remove_file(place.path("log"));
+        let name = many(&place, count);
+        if others {
+            std::fs::rename(place.path(&format!("{name}/200.jpg")), place.path(&format!("{name}/2 00.jpg"))).unwrap();
+        }
+        let output = run(&place, &format!("prepare {name} --out made-{count}"));
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{said}");
         assert!(ran(&place, &[matcher, "--database_path", &format!("made-{count}")]), "{}", log(&place));
-        let noted = String::from_utf8_lossy(&output.stderr).contains("only with those that follow by name");
-        assert_eq!(noted, said);
+        let importer = ["matches_importer", "--match_list_path", "pairs.txt", "--match_type pairs"];
+        assert_eq!(ran(&place, &importer), others);
+        // All images are the same, so that each has pairs; not those that the sequential matcher has.
+        let pairs = log(&place).lines().filter(|line| line.starts_with("list ")).count();
+        assert_eq!(pairs > 1000, others, "{pairs}");
+        assert!(!log(&place).contains("list 000.jpg 001.jpg") && !log(&place).contains("2 00.jpg"));
+        assert_eq!(said.contains("1 images have spaces in their names"), others, "{said}");
     }
+}
+
+#[test]
+fn lenses_have_a_camera_each() {
+    let place = place();
+    for (i, focal) in [26, 13, 26, 13, 77].into_iter().enumerate() {
+        std::fs::write(place.path(&format!("photos/{i}.JPG")), jpeg_of_lens(focal)).unwrap();
+    }
+    let output = run(&place, "prepare photos --out made");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("5 images have 3 combinations of lens and size"), "{said}");
+    let log = log(&place);
+    let parts: Vec<&str> = log.split("colmap feature_extractor --database").skip(1).collect();
+    let lists = parts.iter().map(|part| part.lines().filter(|line| line.starts_with("list ")).collect::<Vec<_>>());
+    assert_eq!(
+        lists.collect::<Vec<_>>(),
+        [vec!["list 0.JPG", "list 2.JPG"], vec!["list 1.JPG", "list 3.JPG"], vec!["list 4.JPG"]]
+    );
+    let shares = parts.iter().map(|part| part.contains("--ImageReader.single_camera 1"));
+    assert_eq!(shares.collect::<Vec<_>>(), [true, true, false]);
+    // With one lens there is one camera and no list.
+    (0..5).for_each(|i| std::fs::write(place.path(&format!("photos/{i}.JPG")), jpeg_of_lens(26)).unwrap());
+    std::fs::remove_file(place.path("log")).unwrap();
+    succeeds(&place, "prepare photos --out again");
+    assert!(ran(&place, &["feature_extractor", "--ImageReader.single_camera 1"]));
+    assert!(!self::log(&place).contains("image_list_path"));
+}
+
+#[test]
+fn glomap_finds_the_poses_of_many_images() {
+    let place = place();
+    let script = COLMAP.replace("echo \"colmap ", "echo \"glomap ");
+    std::fs::write(place.path("bin/glomap"), script).unwrap();
+    std::fs::set_permissions(place.path("bin/glomap"), std::fs::Permissions::from_mode(0o755)).unwrap();
+    for (count, used, models) in [(200, "colmap", "work/models"), (201, "glomap", "work/global")] {
+        let _ = std::fs::remove_file(place.path("log"));
+        let name = many(&place, count);
+        succeeds(&place, &format!("prepare {name} --out made-{count}"));
+        let mappers = log(&place).lines().filter(|line| line.contains(" mapper ")).count();
+        assert!(ran(&place, &[used, " mapper --database_path", models]) && mappers == 1, "{}", log(&place));
+        assert!(place.path(&format!("made-{count}/sparse/0/cameras.txt")).exists());
+    }
+    // It fails, or finds nothing.
+    for (i, script) in ["#!/bin/sh\nexit 1\n", "#!/bin/sh\nexit 0\n"].into_iter().enumerate() {
+        std::fs::write(place.path("bin/glomap"), script).unwrap();
+        let output = run(&place, &format!("prepare many-201 --out fails-{i}"));
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && said.contains("GLOMAP found no poses: COLMAP tries it\n"), "{said}");
+    }
+}
+
+/// Options of training runs on the cameras of the script in place of COLMAP.
+const TRAIN: &str = "--scene-type bounded";
+
+#[test]
+fn train_prepares_images_and_videos_once() {
+    let place = place();
+    for (input, about) in [("photos", "5 images from photos"), ("walk.mp4", "30 sharp frames from walk.mp4")] {
+        let train = format!("train {input} {TRAIN} --steps 1 {CLASSIC} --out run-{input}");
+        let said = succeeds(&place, &train);
+        let line = format!("prepare  {input} has no camera poses: making {input}-prepared with COLMAP\n");
+        assert!(said.starts_with(&line) && said.contains(about) && said.contains(" images registered"), "{said}");
+        let made = place.path(&format!("{input}-prepared")).canonicalize().unwrap();
+        assert_eq!(place.json(&format!("run-{input}/config.json"))["scene"]["folder"], made.to_str().unwrap());
+        // The next run uses the same dataset.
+        std::fs::remove_file(place.path("log")).unwrap();
+        let said = succeeds(&place, &train.replace("--out run", "--out again"));
+        assert!(said.starts_with(&format!("prepared {input}-prepared, made before from {input}\n")), "{said}");
+        assert!(!place.path("log").exists() || !log(&place).contains("mapper"));
+    }
+    // Other images than before, and a folder of something else.
+    let train = format!("train photos {TRAIN} --steps 1 {CLASSIC}");
+    std::fs::write(place.path("photos/new.jpg"), jpeg(4, 1)).unwrap();
+    let refused = "photos-prepared: was not made from photos: remove or rename it";
+    complained("new image", &run(&place, &train), &[refused]);
+    std::fs::remove_dir_all(place.path("photos-prepared")).unwrap();
+    std::fs::create_dir(place.path("photos-prepared")).unwrap();
+    std::fs::write(place.path("photos-prepared/notes.txt"), "mine").unwrap();
+    let output = run(&place, &train);
+    assert!(String::from_utf8_lossy(&output.stderr).contains(refused), "{output:?}");
+    assert_eq!(place.bytes("photos-prepared/notes.txt"), b"mine");
+}
+
+#[test]
+fn train_without_colmap_names_other_ways() {
+    let place = place();
+    let output = command(&place, "train photos").env("PATH", place.path("photos")).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    let lines: Vec<&str> = said.lines().collect();
+    assert!(output.status.code() == Some(1) && lines.len() == 2, "{said}");
+    assert!(lines[0].contains("photos: has no camera poses") && lines[0].contains("Polycam or Record3D"), "{said}");
+    assert!(lines[1].contains("`colmap`: is not on the PATH; install it with `apt install colmap`"), "{said}");
+    assert!(!place.path("photos-prepared").exists());
+}
+
+#[test]
+fn train_prepares_no_folder_that_has_cameras() {
+    let place = place();
+    succeeds(&place, "prepare photos --out made");
+    std::fs::remove_file(place.path("log")).unwrap();
+    complained("inner", &run(&place, "train made/images"), &["is not a dataset, but `made` is"]);
+    std::fs::create_dir_all(place.path("photos/keyframes")).unwrap();
+    complained("export", &run(&place, "train photos"), &["is a raw export of Polycam"]);
+    std::fs::create_dir(place.path("empty")).unwrap();
+    complained("empty", &run(&place, "train empty"), &["is not a dataset: expected transforms.json"]);
+    complained("image", &run(&place, "train sharp.jpg"), &["sharp.jpg: does not describe a capture"]);
+    assert!(!place.path("log").exists());
+}
+
+#[test]
+fn ctrl_c_after_preparing_saves_the_model() {
+    let place = place();
+    let mut command = command(&place, &format!("train photos {TRAIN} --budget 1h {CLASSIC} --out run"));
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    wait(&mut child, || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0));
+    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(sent.success());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{output:?}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("stopped "), "{output:?}");
+    assert!(String::from_utf8_lossy(&output.stderr).contains("stopping after this step"), "{output:?}");
 }
 
 #[test]

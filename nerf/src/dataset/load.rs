@@ -116,6 +116,12 @@ impl Capture {
         Ok(capture)
     }
 
+    /// Returns true if a folder or its parent describes a capture, or if the folder is an export of another program that
+    /// first needs its own conversion. Other folders of images need poses.
+    pub fn is_described(folder: impl AsRef<Path>) -> bool {
+        formats::is_described(folder.as_ref())
+    }
+
     fn split_by_default(&mut self) {
         let held_out = |view: &View| matches!(view.split, Some(Split::Val | Split::Test));
         if self.views.iter().all(|view| view.split.is_none()) {

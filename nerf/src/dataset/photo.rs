@@ -111,6 +111,22 @@ impl Photo {
         Ok(decoder(path.as_ref())?.0.color_type().has_alpha())
     }
 
+    /// Reads the EXIF data of an image file, a TIFF structure, if it has any.
+    ///
+    /// # Errors
+    /// If the file cannot be read or is not an image.
+    pub fn exif_of_file(path: impl AsRef<Path>) -> Result<Option<Vec<u8>>> {
+        let path = path.as_ref();
+        let (start, length) = start_of(path)?;
+        // As for the header, the start of a JPEG suffices.
+        if start.starts_with(JPEG)
+            && let Ok((mut decoder, _)) = decoder_of(Cursor::new(&start), length, path)
+        {
+            return Ok(decoder.exif_metadata().ok().flatten());
+        }
+        Ok(decoder(path)?.0.exif_metadata().ok().flatten())
+    }
+
     /// Returns the share of fully transparent pixels, 0 to 1.
     pub fn transparent_share(&self) -> f64 {
         let clear = self.pixels().filter(|pixel| pixel[3] == 0.0);

@@ -133,6 +133,12 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>) -> Result<Cap
     Ok(capture)
 }
 
+/// Returns true if a folder or its parent has a description, or if the folder is an export of another program.
+pub(in crate::dataset) fn is_described(folder: &Path) -> bool {
+    let is_near = std::iter::once(folder).chain(folder.parent()).any(|near| !descriptions(near).is_empty());
+    is_near || EXPORTS.iter().any(|(name, ..)| folder.join(name).exists())
+}
+
 /// The error of a folder without a description.
 fn unknown(folder: &Path, asked: Option<Format>) -> Error {
     if let Some(format) = asked {

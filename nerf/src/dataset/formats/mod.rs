@@ -25,7 +25,7 @@ mod points;
 pub mod rigid;
 pub mod transforms;
 
-pub(super) use description::read;
+pub(super) use description::{is_described, read};
 
 #[cfg(test)]
 mod kit;
