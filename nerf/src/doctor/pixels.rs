@@ -74,6 +74,8 @@ pub(super) fn examine(seen: &[Seen<'_>], findings: &mut Findings) {
     light(seen, findings);
     masks(seen, findings);
     alpha(seen, findings);
+    let unread = seen.iter().filter(|one| one.look.unread_profile);
+    findings.about(Kind::ColorProfile, unread.map(|one| one.view), &[]);
 }
 
 fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
@@ -215,6 +217,7 @@ mod tests {
             let looks: Vec<Look> = (0..count)
                 .map(|i| Look {
                     transparent: None,
+                    unread_profile: false,
                     hash: 0,
                     sharpness: (i % 5 != 2).then(&mut number),
                     luminance: None,
