@@ -36,6 +36,7 @@ pub use load::LoadOptions;
 pub use mask::Mask;
 pub use photo::Photo;
 pub use photo::save::copy_upright;
+pub use photo::unsupported::heif_size;
 pub use scene_analysis::SceneAnalysis;
 pub use scene_transform::SceneTransform;
 pub use scene_type::SceneType;

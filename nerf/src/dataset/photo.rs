@@ -17,6 +17,7 @@ mod profile;
 mod resample;
 pub(crate) mod save;
 pub(crate) mod sharpness;
+pub(crate) mod unsupported;
 
 /// An RGB or RGBA image with the integers of its file: three or four bytes per pixel, twice that for 16 bits.
 ///
@@ -388,12 +389,15 @@ fn decoder(path: &Path) -> Result<(impl ImageDecoder, [usize; 2])> {
 
 /// [`decoder`] for the contents of a file of `length` bytes.
 pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
-    reader: R,
+    mut reader: R,
     length: u64,
     path: &Path,
 ) -> Result<(impl ImageDecoder + use<'a, R>, [usize; 2])> {
     let bad = |what: String| Error::file(path, format!("cannot be decoded: {what}"));
     let unread = |e| Error::file(path, format!("cannot be read: {e}"));
+    if let Some(what) = unsupported::refusal(&mut reader).map_err(unread)? {
+        return Err(Error::file(path, what));
+    }
     let mut reader = ImageReader::new(reader).with_guessed_format().map_err(unread)?;
     if reader.format() == Some(ImageFormat::WebP) {
         let mut inner = reader.into_inner();
