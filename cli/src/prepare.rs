@@ -2,6 +2,7 @@
 
 mod bounds;
 pub mod convert;
+mod heif;
 mod photographs;
 mod poses;
 pub mod program;

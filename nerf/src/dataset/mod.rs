@@ -35,7 +35,7 @@ pub use hold_out::HoldOut;
 pub use load::LoadOptions;
 pub use mask::Mask;
 pub use photo::Photo;
-pub use photo::save::copy_upright;
+pub use photo::save::{copy_cleared, copy_upright};
 pub use photo::unsupported::heif_size;
 pub use scene_analysis::SceneAnalysis;
 pub use scene_transform::SceneTransform;
