@@ -175,7 +175,10 @@ mod tests {
     use super::*;
     use crate::camera::Camera;
     use crate::dataset::{Format, Image};
+    use crate::doctor::look::look_at_all;
     use glam::{DAffine3, DVec3};
+    use image::codecs::png::PngEncoder;
+    use image::{ExtendedColorType, ImageEncoder};
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64Mcg;
 
@@ -200,6 +203,32 @@ mod tests {
         let [found] = &findings.sorted()[..] else { panic!("not one finding") };
         assert_eq!((found.kind, &found.views[..]), (Kind::MaskShape, &["2".to_owned(), "3".to_owned()][..]));
         assert!(found.what.ends_with("of 2 images: 8x8 pixels, the image has 8x6"), "{}", found.what);
+    }
+
+    #[test]
+    fn unread_color_profiles_are_found() {
+        let folder = tempfile::tempdir().unwrap();
+        let view = |i: u32| {
+            let path = folder.path().join(format!("{i}.png"));
+            let mut bytes = vec![];
+            let mut encoder = PngEncoder::new(&mut bytes);
+            if i == 1 {
+                encoder.set_icc_profile(vec![7; 300]).unwrap();
+            }
+            encoder.write_image(&[i as u8; 48], 4, 4, ExtendedColorType::Rgb8).unwrap();
+            std::fs::write(&path, bytes).unwrap();
+            let camera = Camera::from_angle(4, 4, 0.7, DAffine3::IDENTITY);
+            View { image: Some(path), ..View::new(i.to_string(), i.to_string(), camera) }
+        };
+        let views = (0..3).map(view).collect();
+        let capture = Capture::new(folder.path(), "transforms.json".into(), Format::Transforms, views);
+        let looks = look_at_all(&capture, &|_, _| {});
+        let seen: Vec<_> = looks.iter().map(|(view, look)| Seen { view, look: look.as_ref().unwrap() }).collect();
+        let mut findings = Findings::default();
+        examine(&seen, &mut findings);
+        let [found] = &findings.sorted()[..] else { panic!("not one finding") };
+        assert_eq!((found.kind, &found.views[..]), (Kind::ColorProfile, &["1".to_owned()][..]));
+        assert_eq!(found.what, "cannot read the colour profile of 1 image; colours count as sRGB");
     }
 
     #[test]
