@@ -99,9 +99,9 @@ fn display_p3_becomes_srgb() {
         }
     }
     // Alpha stays.
-    let mut rgba = [200, 30, 30, 77];
+    let mut rgba = [200, 30, 30, 77, 30, 200, 30, 201];
     space.convert(&mut rgba, 4, 255, byte);
-    assert_eq!((&rgba[..3], rgba[3]), (&bytes([200, 30, 30])[..], 77));
+    assert_eq!(rgba.as_slice(), [&bytes([200, 30, 30])[..], &[77], &bytes([30, 200, 30]), &[201]].concat());
 }
 
 /// An image of 16 x 8 pixels in a file of this type, with a profile.
