@@ -9,7 +9,7 @@ use super::program::{FFMPEG, HEIF_CONVERT, HEIF_DEC, Program, file_url};
 use super::workplace::Workplace;
 use crate::interrupt::{Stop, Work};
 
-/// Programs that convert, the best first: ffmpeg leaves out EXIF data, and most versions do not read tiled images.
+/// Programs that convert, the best first: ffmpeg leaves out EXIF data, and some versions do not read tiled images.
 const PROGRAMS: [Program; 3] = [HEIF_CONVERT, HEIF_DEC, FFMPEG];
 /// Of 100. The loss is not visible.
 const QUALITY: &str = "95";
