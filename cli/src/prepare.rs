@@ -5,6 +5,7 @@ mod bounds;
 mod cameras;
 pub mod convert;
 mod exif;
+mod heif;
 mod pairs;
 mod photographs;
 mod poses;

@@ -1,33 +1,61 @@
 //! Folders of images without cameras.
 
+use std::collections::HashSet;
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::dataset::{Photo, copy_upright};
 use raygrad::nerf::{Error, Result};
 
+use super::heif::Heif;
 use super::root::Root;
 use super::workplace::Workplace;
 use crate::interrupt::Work;
 use crate::output::complain;
 use crate::progress::Progress;
 
-/// File extensions that raygrad reads.
+/// File extensions of images that raygrad reads.
 const READ: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
-/// File extensions that raygrad does not read.
-const NOT_READ: [&str; 9] = ["heic", "heif", "avif", "tif", "tiff", "dng", "cr2", "nef", "arw"];
+/// File extensions of images that other programs convert; the content decides.
+const CONVERTED: [&str; 4] = ["heic", "heif", "hif", "avif"];
+/// File extensions of images that raygrad does not read.
+const NOT_READ: [&str; 8] = ["tif", "tiff", "exr", "dng", "cr2", "cr3", "nef", "arw"];
 
-/// Copies the images `found` in a folder to `images` and applies their EXIF orientation. `outside` allows links to
-/// other folders.
+/// Copies the images `found` in a folder to `images`. Applies their EXIF orientation, and converts HEIC and AVIF to
+/// JPEG. `outside` allows links to other folders.
 pub fn copy(folder: &Path, found: &[PathBuf], outside: bool, place: &Workplace) -> Work<usize> {
     if !outside {
         let root = Root::new(folder)?;
         found.iter().try_for_each(|path| root.check(path)).map_err(|what| Error::file(folder, what))?;
     }
-    let to = place.make("images")?;
-    Progress::new().each(&decoding_memory(found), "images copied", |i| {
-        Ok(copy_upright(&found[i], to.join(found[i].file_name().unwrap_or_default()))?)
+    let heif = Heif::find(found)?;
+    let (to, names) = (place.make("images")?, names(found)?);
+    let costs: Vec<u64> =
+        decoding_memory(found).into_iter().zip(heif.memory()).map(|(own, other)| own.max(other)).collect();
+    Progress::new().each(&costs, "images copied", |i| {
+        let to = to.join(&names[i]);
+        if heif.convert(i, &found[i], &to, place)? { Ok(()) } else { Ok(copy_upright(&found[i], &to)?) }
     })?;
     Ok(found.len())
+}
+
+/// The names of the copies: those of the images, but `.jpg` for HEIC and AVIF, or `.heic.jpg` beside an image with that
+/// name.
+fn names(found: &[PathBuf]) -> Result<Vec<PathBuf>> {
+    let lower = |name: &Path| name.to_string_lossy().to_lowercase();
+    let own = |path: &PathBuf| PathBuf::from(path.file_name().unwrap_or_default());
+    let mut taken: HashSet<String> =
+        found.iter().filter(|path| !ends(path, &CONVERTED)).map(|path| lower(&own(path))).collect();
+    let name = |path: &PathBuf| {
+        let own = own(path);
+        if !ends(path, &CONVERTED) {
+            return Ok(own);
+        }
+        let long = PathBuf::from([own.as_os_str(), OsStr::new(".jpg")].join(OsStr::new("")));
+        let free = [own.with_extension("jpg"), long].into_iter().find(|name| taken.insert(lower(name)));
+        free.ok_or_else(|| Error::file(path, "would replace another image as JPEG: rename it"))
+    };
+    found.iter().map(name).collect()
 }
 
 /// Bytes of memory while each image is decoded; 0 if its header cannot be read, as decoding reports the error.
@@ -43,7 +71,7 @@ pub fn ends(path: &Path, endings: &[&str]) -> bool {
 
 /// Refuses a single image as the input.
 pub fn check_no_image(file: &Path) -> Result<()> {
-    match ends(file, &READ) || ends(file, &NOT_READ) {
+    match [&READ[..], &CONVERTED, &NOT_READ].iter().any(|endings| ends(file, endings)) {
         true => Err(Error::file(file, "is a single image: name the folder that holds the images")),
         false => Ok(()),
     }
@@ -52,10 +80,12 @@ pub fn check_no_image(file: &Path) -> Result<()> {
 /// Returns true if [`find`] finds images in a folder, or some that raygrad cannot read.
 pub fn are_in(folder: &Path) -> bool {
     let files = [folder, &folder.join("images")].map(std::fs::read_dir).into_iter().flatten().flatten().flatten();
-    files.map(|entry| entry.path()).any(|path| ends(&path, &READ) || ends(&path, &NOT_READ))
+    files
+        .map(|entry| entry.path())
+        .any(|path| [&READ[..], &CONVERTED, &NOT_READ].iter().any(|endings| ends(&path, endings)))
 }
 
-/// The images in a folder, unsorted. Warns of images that raygrad cannot read.
+/// The images in a folder, sorted by name. Warns of images that raygrad cannot read.
 pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
     let inner = folder.join("images");
     for folder in [folder, &inner] {
@@ -64,17 +94,19 @@ pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
         let shown = entries.flatten().filter(|entry| !entry.file_name().as_encoded_bytes().starts_with(b"."));
         let files: Vec<PathBuf> = shown.map(|entry| entry.path()).filter(|path| path.is_file()).collect();
         let others = files.iter().filter(|path| ends(path, &NOT_READ)).count();
-        let found: Vec<PathBuf> = files.into_iter().filter(|path| ends(path, &READ)).collect();
+        let mut found: Vec<PathBuf> =
+            files.into_iter().filter(|path| ends(path, &READ) || ends(path, &CONVERTED)).collect();
         if others > 0 {
-            let what = "images are HEIC, TIFF or raw, which raygrad cannot read: convert them to JPEG or PNG";
+            let what = "images are TIFF, EXR or raw, which raygrad cannot read: convert them to JPEG or PNG";
             if found.is_empty() {
                 return Err(Error::file(folder, format!("{others} {what}")));
             }
             complain(&format!("warning: {}: {others} {what}", folder.display()));
         }
         if !found.is_empty() {
+            found.sort();
             return Ok(found);
         }
     }
-    Err(Error::file(folder, "holds no images: put .jpg, .png or .webp files in it or in its folder `images`"))
+    Err(Error::file(folder, "holds no images: put .jpg, .png, .webp or .heic files in it or in its folder `images`"))
 }

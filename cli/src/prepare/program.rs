@@ -19,12 +19,12 @@ const KEPT: usize = 12;
 const INTERVAL: Duration = Duration::from_millis(100);
 
 /// An external program.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Program {
     /// Name of the command.
-    name: &'static str,
+    pub name: &'static str,
     /// Installation instructions.
-    install: &'static str,
+    pub install: &'static str,
 }
 
 /// Reads videos.
@@ -33,6 +33,13 @@ pub const FFMPEG: Program = Program {
     install: "`apt install ffmpeg`, `brew install ffmpeg`, `conda install -c conda-forge ffmpeg` or \
               `winget install Gyan.FFmpeg`",
 };
+
+/// Converts HEIC and AVIF, with EXIF data and colour profile.
+pub const HEIF_CONVERT: Program =
+    Program { name: "heif-convert", install: "`apt install libheif-examples` or `brew install libheif`" };
+
+/// The later name of [`HEIF_CONVERT`].
+pub const HEIF_DEC: Program = Program { name: "heif-dec", ..HEIF_CONVERT };
 
 /// Finds camera poses.
 pub const COLMAP: Program = Program {

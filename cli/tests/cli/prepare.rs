@@ -443,13 +443,13 @@ fn bad_inputs_are_named() {
     complained_of(
         "empty",
         &run(&place, "prepare empty --out made"),
-        "empty: holds no images: put .jpg, .png or .webp files in it or in its folder `images`",
+        "empty: holds no images: put .jpg, .png, .webp or .heic files in it or in its folder `images`",
     );
-    std::fs::write(place.path("empty/0.HEIC"), "").unwrap();
+    std::fs::write(place.path("empty/0.TIFF"), "").unwrap();
     complained_of(
-        "heic",
+        "tiff",
         &run(&place, "prepare empty --out made"),
-        "empty: 1 images are HEIC, TIFF or raw, which raygrad cannot read: convert them to JPEG or PNG",
+        "empty: 1 images are TIFF, EXR or raw, which raygrad cannot read: convert them to JPEG or PNG",
     );
     complained("no cameras", &run(&place, "prepare photos --out made --to colmap"), &["photos: is not a dataset"]);
     complained_of("a file", &run(&place, "prepare photos --out walk.mp4"), "walk.mp4: is not a folder");
@@ -659,4 +659,92 @@ fn prepare_follows_a_link_as_output() {
     assert!(place.path("converted/transforms.json").exists());
     let names: Vec<_> = std::fs::read_dir(place.path("converted")).unwrap().map(|e| e.unwrap().file_name()).collect();
     assert_eq!(names.len(), 2, "{names:?}");
+}
+
+/// Replaces heif-convert and ffmpeg: writes `converted.jpg` to its last argument.
+const CONVERTER: &str = r#"#!/bin/sh
+echo "$(pwd) $0 $*" >> "$LOG"
+[ "$1" = -h ] && exit 0
+if [ -n "$FAILS" ]; then echo "damaged input" >&2; exit 2; fi
+for out; do :; done
+[ -n "$SEVERAL" ] && out="${out%.jpg}-1.jpg"
+cp "$(dirname "$LOG")/converted.jpg" "$out"
+"#;
+
+/// A [`place`] with three HEIC images of 16 x 8 pixels, and converters with these names.
+fn place_with_heic(converters: &[&str]) -> Place {
+    let place = place();
+    std::fs::remove_file(place.path("bin/ffmpeg")).unwrap();
+    for name in converters {
+        let path = place.path(&format!("bin/{name}"));
+        std::fs::write(&path, CONVERTER).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+    }
+    // The pixels are upright already, but the orientation stayed.
+    std::fs::write(place.path("converted.jpg"), jpeg(4, 6)).unwrap();
+    for name in ["0.heic", "5.HEIC", "6.jpg"] {
+        std::fs::write(place.path(&format!("photos/{name}")), heic([16, 8])).unwrap();
+    }
+    place
+}
+
+/// The start of a HEIC file.
+fn heic([width, height]: [u32; 2]) -> Vec<u8> {
+    let size = [&width.to_be_bytes()[..], &height.to_be_bytes()].concat();
+    [b"\0\0\0\x18ftypheic\0\0\0\0mif1heic....ispe\0\0\0\0", &size[..]].concat()
+}
+
+#[test]
+fn heic_images_become_upright_jpegs() {
+    for (converters, several, program) in [
+        (&["heif-convert", "ffmpeg"][..], "", "heif-convert -q 95 /"),
+        (&["heif-dec"], "1", "heif-dec -q 95 /"),
+        (&["ffmpeg"], "", "-protocol_whitelist file -f mov -i file:/"),
+    ] {
+        let place = place_with_heic(converters);
+        // A JPEG by its content.
+        std::fs::write(place.path("photos/7.heic"), jpeg(4, 6)).unwrap();
+        let output = command(&place, "prepare photos --out made").env("SEVERAL", several).output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        for name in ["0.heic", "5.HEIC", "6.jpg"] {
+            assert!(ran(&place, &["/heif-", program, &format!("/photos/{name}"), " 0.jpg"]), "{}", log(&place));
+        }
+        assert!(!ran(&place, &[program, "7.heic"]) && !ran(&place, &[program, "0.JPG"]));
+        let mut names: Vec<_> = std::fs::read_dir(place.path("made/images")).unwrap().collect();
+        names.sort_by_key(|entry| entry.as_ref().unwrap().file_name());
+        let names: Vec<_> = names.into_iter().map(|entry| entry.unwrap().file_name()).collect();
+        let all = ["0.JPG", "0.heic.jpg", "1.JPG", "2.JPG", "3.JPG", "4.JPG", "5.jpg", "6.jpg", "7.jpg"];
+        assert_eq!(names, all);
+        assert_eq!(place.bytes("made/images/0.JPG"), place.bytes("photos/0.JPG"));
+        for name in ["0.heic.jpg", "5.jpg", "6.jpg"] {
+            assert_eq!(place.bytes(&format!("made/images/{name}")), jpeg(4, 1), "{name}");
+        }
+        // raygrad itself turns this one.
+        assert_eq!(Photo::size_of_file(place.path("made/images/7.jpg")).unwrap(), [[8, 16]; 2]);
+        let left = std::fs::read_dir(place.path("made")).unwrap().map(|entry| entry.unwrap().file_name());
+        assert!(left.into_iter().all(|name| !name.to_str().unwrap().starts_with("heif")));
+    }
+}
+
+#[test]
+fn failed_conversions_name_the_image() {
+    let install = "`apt install libheif-examples` or `brew install libheif`";
+    let place = place_with_heic(&[]);
+    let expected = ["photos/0.heic: is HEIC or AVIF, which heif-convert reads: install it with ", install];
+    complained("no converter", &run(&place, "prepare photos --out made"), &expected);
+    let place = place_with_heic(&["heif-convert"]);
+    let output = command(&place, "prepare photos --out made").env("FAILS", "yes").output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("  damaged input\n"), "{said}");
+    assert!(said.contains("raygrad: photos/0.heic: `heif-convert`: failed (exit code 2), "), "{said}");
+    assert!(!made(&place).iter().any(|name| name.contains("made")));
+    // Old versions of ffmpeg do not read HEIC, or read a single tile.
+    let place = place_with_heic(&["ffmpeg"]);
+    let output = command(&place, "prepare photos --out made").env("FAILS", "yes").output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains(&format!("is above; install heif-convert with {install}")), "{said}");
+    std::fs::write(place.path("photos/5.HEIC"), heic([4032, 3024])).unwrap();
+    let expected = ["photos/5.HEIC: was not converted: ffmpeg read only 16x8 of 4032x3024 pixels; ", install];
+    complained("a tile", &run(&place, "prepare photos --out made"), &expected);
+    assert!(!made(&place).iter().any(|name| name.contains("made")));
 }

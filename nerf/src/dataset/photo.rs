@@ -11,13 +11,17 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
+use profile::Profile;
+
+mod profile;
 mod resample;
 pub(crate) mod save;
 pub(crate) mod sharpness;
+pub(crate) mod unsupported;
 
 /// An RGB or RGBA image with the integers of its file: three or four bytes per pixel, twice that for 16 bits.
 ///
-/// Colours keep the transfer curve of their file (sRGB for PNG, JPEG and WebP). Alpha is straight (not premultiplied).
+/// Colours are sRGB values. Alpha is straight (not premultiplied).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Photo {
     /// Width in pixels.
@@ -59,6 +63,9 @@ impl Photo {
     /// It applies the EXIF orientation, unless `size`, the width and height of the camera, is that of the stored
     /// pixels: programs that calibrate cameras use these.
     ///
+    /// It converts colours to sRGB by an ICC profile with a matrix and curves, such as Display P3, and clips them.
+    /// Without such a profile colours [count as sRGB](Self::has_unread_profile).
+    ///
     /// # Errors
     /// If the file cannot be read or decoded, or claims more than 2^28 pixels or more than 64 MiB plus 16 KiB per byte
     /// of the file, or needs more memory than is free. The error names it.
@@ -66,12 +73,15 @@ impl Photo {
         let path = path.as_ref();
         let (mut decoder, stored) = decoder_within_memory(path)?;
         let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+        let profile = Profile::of(&mut decoder);
         let decoded = DynamicImage::from_decoder(decoder);
         let mut decoded = decoded.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
         if size != Some(stored) {
             decoded.apply_orientation(turn);
         }
-        Ok(Self::from_decoded(decoded))
+        let mut photo = Self::from_decoded(decoded);
+        profile.convert(&mut photo);
+        Ok(photo)
     }
 
     fn from_decoded(decoded: DynamicImage) -> Self {
@@ -125,6 +135,15 @@ impl Photo {
             return Ok(decoder.exif_metadata().ok().flatten());
         }
         Ok(decoder(path)?.0.exif_metadata().ok().flatten())
+    }
+
+    /// Reads whether an image file has a colour profile that [`open`](Self::open) cannot read: lookup tables, grey,
+    /// CMYK or damage. Its colours then count as sRGB.
+    ///
+    /// # Errors
+    /// If the file cannot be read or is not an image.
+    pub fn has_unread_profile(path: impl AsRef<Path>) -> Result<bool> {
+        Ok(matches!(Profile::of(&mut decoder(path.as_ref())?.0), Profile::Unread))
     }
 
     /// Returns the share of fully transparent pixels, 0 to 1.
@@ -386,12 +405,15 @@ fn decoder(path: &Path) -> Result<(impl ImageDecoder, [usize; 2])> {
 
 /// [`decoder`] for the contents of a file of `length` bytes.
 pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
-    reader: R,
+    mut reader: R,
     length: u64,
     path: &Path,
 ) -> Result<(impl ImageDecoder + use<'a, R>, [usize; 2])> {
     let bad = |what: String| Error::file(path, format!("cannot be decoded: {what}"));
     let unread = |e| Error::file(path, format!("cannot be read: {e}"));
+    if let Some(what) = unsupported::refusal(&mut reader).map_err(unread)? {
+        return Err(Error::file(path, what));
+    }
     let mut reader = ImageReader::new(reader).with_guessed_format().map_err(unread)?;
     if reader.format() == Some(ImageFormat::WebP) {
         let mut inner = reader.into_inner();

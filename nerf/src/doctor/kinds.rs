@@ -193,6 +193,11 @@ kinds! {
     OpaqueAlpha = "opaque-alpha", Note,
         "the alpha channel of {} is opaque everywhere",
         "Alpha then says nothing about the background. For an object on an empty background, save it with alpha 0.";
+    /// Colour profiles cannot be read.
+    ColorProfile = "color-profile", Note,
+        "cannot read the colour profile of {}; colours count as sRGB",
+        "Nothing to do if the colours look right. Otherwise convert the images to sRGB. raygrad reads RGB profiles \
+         with a matrix and curves.";
     /// Single images do not match their cameras.
     WrongPose = "wrong-pose", Warning,
         "cannot match {} with neighbouring images at the places that the poses predict",

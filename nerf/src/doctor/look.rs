@@ -21,6 +21,8 @@ const DARK: f64 = 0.01;
 pub(super) struct Look {
     /// True if a pixel is transparent; `None` without an alpha channel.
     pub transparent: Option<bool>,
+    /// True if the colour profile cannot be read.
+    pub unread_profile: bool,
     /// Equal for equal images.
     pub hash: u64,
     /// The logarithm of the variance of the Laplacian over the variance of the brightness; `None` of a flat image.
@@ -56,6 +58,7 @@ fn look_at(view: &View) -> Result<Look> {
     let [stored, shown] = Photo::size_of_file(&path)?;
     let size = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera));
     let photo = Photo::open(&path, size)?;
+    let unread_profile = Photo::has_unread_profile(&path)?;
     let transparent = photo.has_alpha().then(|| photo.transparent_share() > 0.0);
     let middle = shrunk(&photo, LONGEST);
     let small = shrunk(&photo, SMALL);
@@ -69,7 +72,8 @@ fn look_at(view: &View) -> Result<Look> {
     let (luminance, balance) = light(&small.to_image());
     let picture = size.and_then(|_| Picture::new(&view.camera, &small, mask.as_ref()));
     let sharpness = sharpness(&grey(&middle, mean(&small.to_image())));
-    Ok(Look { transparent, hash: hasher.finish(), sharpness, luminance, balance, used, picture })
+    let hash = hasher.finish();
+    Ok(Look { transparent, unread_profile, hash, sharpness, luminance, balance, used, picture })
 }
 
 /// Downsizes an image to a longest side of at most `longest`.

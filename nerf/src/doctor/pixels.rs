@@ -74,6 +74,8 @@ pub(super) fn examine(seen: &[Seen<'_>], findings: &mut Findings) {
     light(seen, findings);
     masks(seen, findings);
     alpha(seen, findings);
+    let unread = seen.iter().filter(|one| one.look.unread_profile);
+    findings.about(Kind::ColorProfile, unread.map(|one| one.view), &[]);
 }
 
 fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
@@ -173,7 +175,10 @@ mod tests {
     use super::*;
     use crate::camera::Camera;
     use crate::dataset::{Format, Image};
+    use crate::doctor::look::look_at_all;
     use glam::{DAffine3, DVec3};
+    use image::codecs::png::PngEncoder;
+    use image::{ExtendedColorType, ImageEncoder};
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64Mcg;
 
@@ -201,6 +206,32 @@ mod tests {
     }
 
     #[test]
+    fn unread_color_profiles_are_found() {
+        let folder = tempfile::tempdir().unwrap();
+        let view = |i: u32| {
+            let path = folder.path().join(format!("{i}.png"));
+            let mut bytes = vec![];
+            let mut encoder = PngEncoder::new(&mut bytes);
+            if i == 1 {
+                encoder.set_icc_profile(vec![7; 300]).unwrap();
+            }
+            encoder.write_image(&[i as u8; 48], 4, 4, ExtendedColorType::Rgb8).unwrap();
+            std::fs::write(&path, bytes).unwrap();
+            let camera = Camera::from_angle(4, 4, 0.7, DAffine3::IDENTITY);
+            View { image: Some(path), ..View::new(i.to_string(), i.to_string(), camera) }
+        };
+        let views = (0..3).map(view).collect();
+        let capture = Capture::new(folder.path(), "transforms.json".into(), Format::Transforms, views);
+        let looks = look_at_all(&capture, &|_, _| {});
+        let seen: Vec<_> = looks.iter().map(|(view, look)| Seen { view, look: look.as_ref().unwrap() }).collect();
+        let mut findings = Findings::default();
+        examine(&seen, &mut findings);
+        let [found] = &findings.sorted()[..] else { panic!("not one finding") };
+        assert_eq!((found.kind, &found.views[..]), (Kind::ColorProfile, &["1".to_owned()][..]));
+        assert_eq!(found.what, "cannot read the colour profile of 1 image; colours count as sRGB");
+    }
+
+    #[test]
     fn residuals_are_from_the_median_of_the_nearest() {
         let mut rng = Pcg64Mcg::seed_from_u64(5);
         for count in [3, 4, 9, 40, 2500] {
@@ -215,6 +246,7 @@ mod tests {
             let looks: Vec<Look> = (0..count)
                 .map(|i| Look {
                     transparent: None,
+                    unread_profile: false,
                     hash: 0,
                     sharpness: (i % 5 != 2).then(&mut number),
                     luminance: None,

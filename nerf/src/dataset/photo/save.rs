@@ -74,6 +74,28 @@ pub fn copy_upright(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> 
     save(&decoded, to, about)
 }
 
+/// Copies an image file whose pixels are upright already, and sets its EXIF orientation, if it has one, to 1.
+///
+/// Converters of HEIC turn the pixels, but some keep the orientation of the original. Nothing else changes.
+///
+/// # Errors
+/// If the file cannot be read, decoded or written.
+pub fn copy_cleared(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> {
+    let (from, to) = (from.as_ref(), to.as_ref());
+    let (mut decoder, _) = decoder_within_memory(from)?;
+    let exif = decoder.exif_metadata().ok().flatten().filter(|exif| Orientation::from_exif_chunk(exif).is_some());
+    DynamicImage::from_decoder(decoder).map_err(|e| Error::file(from, format!("cannot be decoded: {e}")))?;
+    let mut bytes = std::fs::read(from).map_err(|e| Error::file(from, format!("cannot be read: {e}")))?;
+    if let Some(exif) = exif {
+        // The decoder returns bytes of the file.
+        let Some(at) = bytes.windows(exif.len()).position(|window| window == exif) else {
+            return Err(Error::file(from, "has EXIF data that cannot be changed: remove its orientation"));
+        };
+        let _ = Orientation::remove_from_exif_chunk(&mut bytes[at..at + exif.len()]);
+    }
+    write_atomic(to, &bytes)
+}
+
 fn save(decoded: &DynamicImage, path: &Path, about: About) -> Result<()> {
     let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_ascii_lowercase();
     let mut bytes = vec![];
@@ -146,6 +168,12 @@ mod tests {
         for turn in [1, 6] {
             let about = About { exif: Some(exif(turn)), icc: Some(vec![7; 300]) };
             save(&picture.clone().into(), &from, about).unwrap();
+            // Upright already: the orientation changes alone.
+            copy_cleared(&from, &to).unwrap();
+            assert_eq!(Photo::open(&from, Some([16, 8])).unwrap(), Photo::open(&to, None).unwrap());
+            let (mut decoder, _) = decoder_within_memory(&to).unwrap();
+            assert_eq!(decoder.exif_metadata().unwrap(), Some(exif(1)));
+            assert_eq!(std::fs::read(&from).unwrap() == std::fs::read(&to).unwrap(), turn == 1);
             copy_upright(&from, &to).unwrap();
             if turn == 1 {
                 assert_eq!(std::fs::read(&from).unwrap(), std::fs::read(&to).unwrap());
@@ -161,6 +189,7 @@ mod tests {
             assert_eq!(decoder.icc_profile().unwrap(), Some(vec![7; 300]));
         }
         std::fs::write(&from, b"no picture").unwrap();
+        assert!(copy_cleared(&from, &to).unwrap_err().to_string().contains("from.jpg: cannot be decoded"));
         assert!(copy_upright(&from, &to).unwrap_err().to_string().contains("from.jpg: cannot be decoded"));
     }
 }
