@@ -39,9 +39,8 @@ fn depth_loss_uses_depth_files() {
     place.fails(&format!("train captured --steps 1 --depth-loss {SMALL}"), &["`loss_terms`", "depth_file_path"]);
     std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
     let [plain, usual, heavy] = [loss("", "plain"), loss("--depth-loss", "usual"), loss("--depth-loss=2", "heavy")];
-    // Few images have a distortion loss too.
-    assert_eq!(terms(&place, "usual")[1], json!({ "kind": "depth", "weight": 0.1 }));
-    assert_eq!(terms(&place, "heavy")[1], json!({ "kind": "depth", "weight": 2.0 }));
+    assert_eq!(terms(&place, "usual"), json!([{ "kind": "depth", "weight": 0.1 }]));
+    assert_eq!(terms(&place, "heavy"), json!([{ "kind": "depth", "weight": 2.0 }]));
     assert!(usual > plain, "{usual} {plain}");
     assert!(((heavy - plain) / (usual - plain) - 20.0).abs() < 1e-3, "{plain} {usual} {heavy}");
     // Conversions keep depth if the format supports it, and warn otherwise.
@@ -64,9 +63,7 @@ fn depth_loss_uses_depth_files() {
 fn loss_terms_and_near_plane_are_configurable() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out one {SMALL} --loss entropy=0.001 --near 2.5"));
-    // Few images have a weak distortion loss.
-    let few = json!({ "kind": "distortion", "weight": 0.02 });
-    assert_eq!(terms(&place, "one"), json!([few, { "kind": "entropy", "weight": 0.001 }]));
+    assert_eq!(terms(&place, "one"), json!([{ "kind": "entropy", "weight": 0.001 }]));
     assert_eq!(place.json("one/config.json")["scene_box"]["near_far"][0], 2.5);
     // Loss terms of the scene type are replaced or removed.
     for (flag, expected) in [

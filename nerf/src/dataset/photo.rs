@@ -12,11 +12,13 @@ use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use profile::Profile;
+use start::start_of;
 
 mod profile;
 mod resample;
 pub(crate) mod save;
 pub(crate) mod sharpness;
+mod start;
 pub(crate) mod unsupported;
 
 /// An RGB or RGBA image with the integers of its file: three or four bytes per pixel, twice that for 16 bits.
@@ -80,7 +82,12 @@ impl Photo {
             decoded.apply_orientation(turn);
         }
         let mut photo = Self::from_decoded(decoded);
-        profile.convert(&mut photo);
+        match &mut photo.values {
+            Values::Bytes(values) => profile.convert_bytes(values, photo.channels),
+            Values::Words(values) => profile.convert_words(values, photo.channels),
+            // Decoded files hold integers.
+            Values::Floats(_) => {}
+        }
         Ok(photo)
     }
 
@@ -312,18 +319,6 @@ impl Header {
 
 /// The first bytes of a JPEG file.
 const JPEG: &[u8] = b"\xff\xd8\xff";
-/// The bytes that are read of a JPEG for its header. If EXIF and colour profiles take more, all of it is read.
-const START: u64 = 1 << 18;
-
-/// The first bytes of a file, and its length.
-fn start_of(path: &Path) -> Result<(Vec<u8>, u64)> {
-    let bad = |e: std::io::Error| Error::file(path, format!("cannot be read: {e}"));
-    let file = File::open(path).map_err(bad)?;
-    let (mut start, length) = (vec![], file.metadata().map_err(bad)?.len());
-    file.take(START).read_to_end(&mut start).map_err(bad)?;
-    Ok((start, length))
-}
-
 /// Returns true for a progressive JPEG, by the marker of its frame: its decoder holds all coefficients.
 fn is_progressive(start: &[u8]) -> bool {
     if !start.starts_with(JPEG) {

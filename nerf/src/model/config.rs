@@ -49,11 +49,9 @@ const CAMERA_WARMUP: f64 = 0.1;
 /// The share of a run over which detail is enabled while poses are learned.
 const COARSE: f64 = 0.4;
 
-/// The most images that count as few; the share of a run over which detail is enabled then, and the weight of the
-/// distortion loss.
+/// The most images that count as few, and the share of a run over which detail is enabled then.
 const FEW_IMAGES: usize = 16;
 const FEW_IMAGES_COARSE: f64 = 0.5;
-const FEW_IMAGES_DISTORTION: f64 = 0.02;
 
 /// A named configuration, for [`Config::preset`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -308,15 +306,10 @@ impl Config {
     /// Adapts the configuration to the number of training images.
     ///
     /// Up to 16 images leave much of a scene to chance. Detail then fades in over the first half of the run, from coarse
-    /// to fine (Yang et al. 2023, "FreeNeRF"), and a bounded scene gets a weak [distortion loss](DistortionConfig)
-    /// against floaters. Figures are in docs/benchmarks/results.md, section Few images.
+    /// to fine (Yang et al. 2023, "FreeNeRF"). Figures are in docs/benchmarks/results.md, section Few images.
     pub fn with_images(mut self, count: usize) -> Self {
-        if count > FEW_IMAGES {
-            return self;
-        }
-        self.camera_optimizer.coarse = FEW_IMAGES_COARSE;
-        if self.loss_terms.iter().all(|term| term.get::<DistortionConfig>().is_none()) {
-            self.loss_terms.push(LossTermConfig::new(DistortionConfig { weight: FEW_IMAGES_DISTORTION }));
+        if count <= FEW_IMAGES {
+            self.camera_optimizer.coarse = FEW_IMAGES_COARSE;
         }
         self
     }
@@ -503,16 +496,12 @@ mod tests {
     }
 
     #[test]
-    fn few_images_get_detail_late_and_a_distortion_loss() {
+    fn few_images_get_detail_late() {
         let preset = Config::preset(Preset::Instant);
-        let weight = |config: &Config| config.loss_terms[0].get::<DistortionConfig>().unwrap().weight;
         let few = preset.clone().with_images(16);
         few.check().unwrap();
-        assert_eq!((few.camera_optimizer.coarse, few.loss_terms.len(), weight(&few)), (0.5, 1, 0.02));
+        assert_eq!([0.0, 0.25, 0.5, 1.0].map(|fraction| few.camera_optimizer.detail(fraction)), [0.0, 0.5, 1.0, 1.0]);
         assert_eq!(preset.clone().with_images(17), preset);
-        // The weight of an unbounded scene stays.
-        let unbounded = preset.with_scene_type(SceneType::Unbounded).with_images(3);
-        assert_eq!((unbounded.loss_terms.len(), weight(&unbounded)), (1, 0.1));
     }
 
     #[test]

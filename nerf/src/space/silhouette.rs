@@ -5,37 +5,56 @@ use crate::camera::pinhole::Camera;
 use crate::dataset::{Dataset, Frame};
 use crate::space::occupancy::OccupancyGrid;
 use glam::{DAffine3, DVec3};
+use raygrad_tensor::parallel;
 
 /// The margin in pixels that must be transparent too: the footprint of the image's filter.
 const MARGIN: f64 = 1.5;
 
-/// The silhouette of one image.
-struct Silhouette<'a> {
-    camera: &'a Camera,
+/// The silhouette of one image, as a pinhole sees it.
+struct Silhouette {
     world_to_camera: DAffine3,
+    /// The columns and rows.
+    size: [usize; 2],
+    focal: [f64; 2],
+    centre: [f64; 2],
+    /// The margin in pixels that must be transparent too.
+    margin: f64,
     /// For each corner between pixels, row-major, the number of pixels above it and to its left that are not fully
     /// transparent.
     sums: Vec<u32>,
 }
 
-impl<'a> Silhouette<'a> {
-    /// `None` if the image has no transparency, or is a panorama.
-    fn new(frame: &'a Frame) -> Option<Self> {
+impl Silhouette {
+    /// `None` if the image has no transparency, or is a panorama. `rectified` keeps maps for images of the same camera.
+    fn new(frame: &Frame, rectified: &mut Vec<Rectified>) -> Option<Self> {
         let Frame { camera, image, mask, .. } = frame;
         if !image.has_alpha() || camera.lens == Lens::Equirectangular {
             return None;
         }
-        let stride = image.width + 1;
-        let mut sums = vec![0; stride * (image.height + 1)];
-        for y in 0..image.height {
-            let mut row = 0;
-            for x in 0..image.width {
-                let used = mask.as_ref().is_none_or(|mask| mask.uses(x, y));
-                row += u32::from(!used || image.pixel(x, y)[3] > 0.0);
-                sums[(y + 1) * stride + x + 1] = sums[y * stride + x + 1] + row;
-            }
+        let size = [image.width, image.height];
+        let is_opaque = |x: usize, y: usize| {
+            let used = mask.as_ref().is_none_or(|mask| mask.uses(x, y));
+            !used || image.pixel(x, y)[3] > 0.0
+        };
+        let sums = sums(size, is_opaque);
+        let Camera { focal, centre, .. } = *camera;
+        let world_to_camera = camera.pose.inverse();
+        if camera.lens == Lens::Pinhole {
+            return Some(Silhouette { world_to_camera, size, focal, centre, margin: MARGIN, sums });
         }
-        Some(Silhouette { camera, world_to_camera: camera.pose.inverse(), sums })
+        let known = rectified.iter().position(|map| map.is_of(camera));
+        let map = known.unwrap_or_else(|| {
+            rectified.push(Rectified::new(camera));
+            rectified.len() - 1
+        });
+        let Rectified { size, focal, centre, ref windows, .. } = rectified[map];
+        let stride = camera.width + 1;
+        let is_opaque = |x: usize, y: usize| {
+            windows[y * size[0] + x]
+                .is_none_or(|window| !is_clear(&sums, stride, window.map(|ends| ends.map(|end| end as usize))))
+        };
+        let sums = self::sums(size, is_opaque);
+        Some(Silhouette { world_to_camera, size, focal, centre, margin: 0.0, sums })
     }
 
     /// Returns true if the whole ball projects into the image, onto fully transparent pixels only.
@@ -45,27 +64,106 @@ impl<'a> Silhouette<'a> {
         if depth <= 1.01 * radius {
             return false;
         }
-        let tangents = [local.x / depth, -local.y / depth].map(|tangent| {
+        let mut window = [[0; 2]; 2];
+        for (axis, tangent) in [local.x / depth, -local.y / depth].into_iter().enumerate() {
             // |(x + dx) / (z + dz) - x / z| = |dx - (x / z) dz| / (z + dz) for a point of the ball.
             let reach = radius * (1.0 + tangent.abs()) / (depth - radius);
-            [tangent - reach, tangent + reach]
-        });
-        let Some(places) = distorted(&self.camera.lens, tangents) else { return false };
-        let mut window = [[0; 2]; 2];
-        let sizes = [self.camera.width, self.camera.height];
-        for (axis, places) in places.into_iter().enumerate() {
-            let [low, high] = places.map(|place| self.camera.centre[axis] + self.camera.focal[axis] * place);
-            let (low, high) = ((low - MARGIN).floor(), (high + MARGIN).ceil());
-            if !(low >= 0.0 && high <= sizes[axis] as f64) {
-                return false;
-            }
-            window[axis] = [low as usize, high as usize];
+            let ends = [tangent - reach, tangent + reach].map(|t| self.centre[axis] + self.focal[axis] * t);
+            let Some(ends) = pixels(ends, self.margin, self.size[axis]) else { return false };
+            window[axis] = ends.map(|end| end as usize);
         }
-        let [[left, right], [top, bottom]] = window;
-        let at = |x: usize, y: usize| self.sums[y * (self.camera.width + 1) + x];
-        at(right, bottom) + at(left, top) == at(left, bottom) + at(right, top)
+        is_clear(&self.sums, self.size[0] + 1, window)
     }
 }
+
+/// The pixels of an interval with a margin, from the first to beyond the last; `None` if they are not all within the
+/// image.
+fn pixels([low, high]: [f64; 2], margin: f64, side: usize) -> Option<[u32; 2]> {
+    let (low, high) = ((low - margin).floor(), (high + margin).ceil());
+    (low >= 0.0 && high <= side as f64).then_some([low as u32, high as u32])
+}
+
+/// The numbers of opaque pixels above and to the left of each corner.
+fn sums([width, height]: [usize; 2], is_opaque: impl Fn(usize, usize) -> bool) -> Vec<u32> {
+    let stride = width + 1;
+    let mut sums = vec![0; stride * (height + 1)];
+    for y in 0..height {
+        let mut row = 0;
+        for x in 0..width {
+            row += u32::from(is_opaque(x, y));
+            sums[(y + 1) * stride + x + 1] = sums[y * stride + x + 1] + row;
+        }
+    }
+    sums
+}
+
+/// Returns true if no pixel of the window `[[left, right], [top, bottom]]` is opaque.
+fn is_clear(sums: &[u32], stride: usize, [[left, right], [top, bottom]]: [[usize; 2]; 2]) -> bool {
+    let at = |x: usize, y: usize| sums[y * stride + x];
+    at(right, bottom) + at(left, top) == at(left, bottom) + at(right, top)
+}
+
+/// A map from the pixels of a pinhole to those that a lens gives them, with [`MARGIN`].
+struct Rectified {
+    camera: Camera,
+    size: [usize; 2],
+    focal: [f64; 2],
+    centre: [f64; 2],
+    /// For each pixel of the pinhole, the window of the image; `None` if the image does not show all of it.
+    windows: Vec<Option<[[u32; 2]; 2]>>,
+}
+
+/// The largest side of a rectified image, as a multiple of that of the image. It cuts the border of wide fisheyes.
+const WIDEST: f64 = 3.0;
+
+/// The least side of a rectified image, whose pixels blur a silhouette, as far as four times the resolution suffices.
+const FINEST: f64 = 600.0;
+
+impl Rectified {
+    /// The pinhole covers what the image shows, at its resolution or above.
+    fn new(camera: &Camera) -> Self {
+        let sides = [camera.width as f64, camera.height as f64];
+        let mut ends = [[0.0_f64; 2]; 2];
+        // The border shows the outermost directions.
+        let along = |side: usize| (0..=BORDER).map(move |i| i as f64 / BORDER as f64 * sides[side]);
+        let columns = along(0).flat_map(|x| [[x, 0.0], [x, sides[1]]]);
+        for place in columns.chain(along(1).flat_map(|y| [[0.0, y], [sides[0], y]])) {
+            let place = [0, 1].map(|axis| (place[axis] - camera.centre[axis]) / camera.focal[axis]);
+            let direction = camera.lens.nearest(place);
+            for axis in 0..2 {
+                let most = WIDEST * sides[axis] / camera.focal[axis];
+                let tangent =
+                    if direction.z > 0.0 { direction[axis] / direction.z } else { most * direction[axis].signum() };
+                let tangent = tangent.clamp(-0.5 * most, 0.5 * most);
+                ends[axis] = [ends[axis][0].min(tangent), ends[axis][1].max(tangent)];
+            }
+        }
+        let focal = camera.focal.map(|focal| focal * (FINEST / sides[0].max(sides[1])).clamp(1.0, 4.0));
+        let size = [0, 1].map(|axis| ((ends[axis][1] - ends[axis][0]) * focal[axis]).ceil().max(1.0) as usize);
+        let centre = [0, 1].map(|axis| -ends[axis][0] * focal[axis]);
+        let window = |x: usize, y: usize| {
+            let tangents = |axis: usize, pixel: usize| {
+                [pixel, pixel + 1].map(|corner| (corner as f64 - centre[axis]) / focal[axis])
+            };
+            let places = distorted(&camera.lens, [tangents(0, x), tangents(1, y)])?;
+            let ends = |axis: usize| {
+                let places = places[axis].map(|place| camera.centre[axis] + camera.focal[axis] * place);
+                pixels(places, MARGIN, [camera.width, camera.height][axis])
+            };
+            Some([ends(0)?, ends(1)?])
+        };
+        let rows = parallel::collect(size[1], |y| (0..size[0]).map(|x| window(x, y)).collect::<Vec<_>>());
+        Rectified { camera: camera.clone(), size, focal, centre, windows: rows.concat() }
+    }
+
+    /// Returns true if it holds for the camera, apart from its pose.
+    fn is_of(&self, camera: &Camera) -> bool {
+        Camera { pose: self.camera.pose, ..camera.clone() } == self.camera
+    }
+}
+
+/// Places along each side of an image whose directions bound what it shows.
+const BORDER: usize = 256;
 
 /// The share of its size by which the box of distorted points is grown on each side, and the least size of the box as a
 /// share of the undistorted one.
@@ -79,9 +177,6 @@ const SHRUNK: f64 = 0.25;
 /// `h^2 / 8` times the second derivative. That is less than the growth, `h / 2` times the first derivative, unless the
 /// first derivative changes by a factor of four within `h`.
 fn distorted(lens: &Lens, tangents: [[f64; 2]; 2]) -> Option<[[f64; 2]; 2]> {
-    if *lens == Lens::Pinhole {
-        return Some(tangents);
-    }
     let three = tangents.map(|[low, high]| [low, 0.5 * (low + high), high]);
     let mut ends = [[f64::INFINITY, f64::NEG_INFINITY]; 2];
     for x in three[0] {
@@ -107,11 +202,12 @@ const EACH: usize = 8;
 /// visual hull (Laurentini 1994), robust to wrong masks in fewer images. Images without transparency do not vote; 0
 /// votes carve nothing.
 pub(crate) fn carve(grid: &mut OccupancyGrid, data: &Dataset, votes: u32) {
-    let views = data.frames.iter().filter_map(Silhouette::new);
+    let mut rectified = vec![];
+    let views = data.frames.iter().filter_map(|frame| Silhouette::new(frame, &mut rectified));
     carve_views(grid, &views.collect::<Vec<_>>(), votes);
 }
 
-fn carve_views(grid: &mut OccupancyGrid, views: &[Silhouette<'_>], votes: u32) {
+fn carve_views(grid: &mut OccupancyGrid, views: &[Silhouette], votes: u32) {
     let votes = (votes as usize).min(views.len().div_ceil(EACH));
     if votes == 0 {
         return;
@@ -140,10 +236,14 @@ mod tests {
         Frame { name: String::new(), camera, image: image.into(), mask: None, distances: None }
     }
 
+    fn of(frame: &Frame) -> Silhouette {
+        Silhouette::new(frame, &mut vec![]).unwrap()
+    }
+
     #[test]
     fn carving_needs_every_pixel_transparent() {
         let frame = view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y);
-        let silhouette = Silhouette::new(&frame).unwrap();
+        let silhouette = of(&frame);
         // At the distance 10 the image is 5.1 wide, and a pixel 0.085.
         assert!(!silhouette.is_clear(DVec3::ZERO, 0.01), "in the middle");
         assert!(silhouette.is_clear(DVec3::new(1.7, 0.0, 0.0), 0.3));
@@ -158,10 +258,10 @@ mod tests {
         let opaque = Frame { image: Image::new(60, 60, 3).into(), ..frame.clone() };
         let panorama =
             Frame { camera: Camera { lens: Lens::Equirectangular, ..frame.camera.clone() }, ..frame.clone() };
-        assert!(Silhouette::new(&opaque).is_none() && Silhouette::new(&panorama).is_none());
+        assert!([opaque, panorama].iter().all(|frame| Silhouette::new(frame, &mut vec![]).is_none()));
         // Masked pixels are unknown, so they may be opaque.
         let masked = Frame { mask: Some(Mask::new(60, 60, |x, _| x < 40).into()), ..frame.clone() };
-        assert!(!Silhouette::new(&masked).unwrap().is_clear(DVec3::new(1.7, 0.0, 0.0), 0.3));
+        assert!(!of(&masked).is_clear(DVec3::new(1.7, 0.0, 0.0), 0.3));
     }
 
     #[test]
@@ -169,7 +269,7 @@ mod tests {
         let views = [view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y), view(DVec3::new(10.0, 0.0, 0.0), DVec3::Y)];
         let mut grid =
             OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &OccupancyConfig::default()).unwrap();
-        let views: Vec<_> = views.iter().map(|frame| Silhouette::new(frame).unwrap()).collect();
+        let views: Vec<_> = views.iter().map(|frame| of(frame)).collect();
         carve_views(&mut grid, &views, 1);
         // A third of 5.1 in perspective, with a margin of two pixels and a cell.
         for axis in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]) {
@@ -242,7 +342,7 @@ mod tests {
             });
             let config = OccupancyConfig { resolution: 64, ..OccupancyConfig::default() };
             let mut grid = OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &config).unwrap();
-            let views: Vec<_> = views.iter().map(|frame| Silhouette::new(frame).unwrap()).collect();
+            let views: Vec<_> = views.iter().map(|frame| of(frame)).collect();
             carve_views(&mut grid, &views, 1);
             for axis in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]) {
                 assert!(grid.is_occupied(0.8 * axis), "{lens:?}: {axis} is the object's");
@@ -270,7 +370,7 @@ mod tests {
             }
             let config = OccupancyConfig { resolution: 32, ..OccupancyConfig::default() };
             let mut grid = OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &config).unwrap();
-            let views: Vec<_> = views.iter().map(|frame| Silhouette::new(frame).unwrap()).collect();
+            let views: Vec<_> = views.iter().map(|frame| of(frame)).collect();
             carve_views(&mut grid, &views, votes);
             grid.occupied_share()
         };

@@ -1,6 +1,5 @@
 //! ICC profiles: conversion of colours to sRGB.
 
-use super::{Photo, Values};
 use crate::dataset::color_space::SrgbEncode;
 use glam::{DMat3, DVec3, Mat3, Vec3};
 use image::ImageDecoder;
@@ -32,14 +31,17 @@ impl Profile {
         }
     }
 
-    /// Converts the colours of an image to sRGB; colours outside of sRGB are clipped.
-    pub fn convert(&self, photo: &mut Photo) {
-        let Profile::Rgb(space) = self else { return };
-        match &mut photo.values {
-            Values::Bytes(values) => space.convert(values, photo.channels, 255, byte),
-            Values::Words(values) => space.convert(values, photo.channels, 65535, |value| value),
-            // Decoded files hold integers.
-            Values::Floats(_) => {}
+    /// Converts the colours of 8-bit pixels to sRGB; colours outside of sRGB are clipped.
+    pub fn convert_bytes(&self, values: &mut [u8], channels: usize) {
+        if let Profile::Rgb(space) = self {
+            space.convert(values, channels, 255, byte);
+        }
+    }
+
+    /// [`convert_bytes`](Self::convert_bytes) for 16-bit pixels.
+    pub fn convert_words(&self, values: &mut [u16], channels: usize) {
+        if let Profile::Rgb(space) = self {
+            space.convert(values, channels, 65535, |value| value);
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Image formats that are recognised but not decoded.
 
-use super::start_of;
+use super::start::start_of;
 use crate::error::Result;
 use std::io::{BufRead, Read, Result as IoResult, Seek, SeekFrom};
 use std::path::Path;

@@ -40,7 +40,7 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
 }
 
 /// The folder of the capture of a model: that of `sparse` for the model `sparse/0`, also in `colmap` or `distorted`.
-pub(in super::super) fn root(model: &Path) -> PathBuf {
+pub(crate) fn root(model: &Path) -> PathBuf {
     let sparse = model.ancestors().take(2).find(|folder| folder.ends_with("sparse"));
     let Some(parent) = sparse.and_then(Path::parent) else { return model.to_owned() };
     let is_inner = ["colmap", "distorted"].iter().any(|name| parent.ends_with(name));
