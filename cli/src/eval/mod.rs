@@ -120,8 +120,9 @@ fn level(skip: Skipping) -> String {
 }
 
 /// The rule that selects the held-out images.
-fn hold_out(opened: &Opened) -> &'static str {
+fn hold_out(run: &Run, opened: &Opened) -> &'static str {
     match &opened.capture {
+        Some(_) if run.config.test.is_some() => "as `train --test` chose",
         None => "built in",
         Some((capture, _)) if Capture::holds_out_every_eighth(capture) => "every eighth by name, from the first",
         Some(_) => "as the capture's files say",
@@ -192,7 +193,7 @@ pub fn run(args: &Args) -> Result<()> {
         raygrad: env!("CARGO_PKG_VERSION"),
         scene: scene.absolute()?,
         split: args.split,
-        hold_out: hold_out(&opened),
+        hold_out: hold_out(&run, &opened),
         views: per_view.len(),
         width: data.frames[0].image.width,
         height: data.frames[0].image.height,

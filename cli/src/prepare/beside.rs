@@ -1,6 +1,5 @@
 //! Datasets that `raygrad train` prepares beside a video or images without cameras.
 
-use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
@@ -58,8 +57,11 @@ fn check_made_from(input: &Path, out: &Path) -> Work<()> {
         complain(&error.to_string());
         return Err(Error::file(out, what).into());
     }
-    let names = |files: Vec<PathBuf>| -> BTreeSet<OsString> {
-        files.iter().filter_map(|file| Some(file.file_name()?.to_owned())).collect()
+    // Conversion may replace an extension, or add one.
+    let names = |files: Vec<PathBuf>| {
+        let mut names: Vec<OsString> = files.iter().filter_map(|file| photographs::stem(file)).collect();
+        names.sort();
+        names
     };
     if input.is_dir() && names(photographs::find(input)?) != names(entries(&out.join("images"))?) {
         return Err(Error::file(out, what).into());

@@ -1,6 +1,6 @@
 //! `raygrad train` on captures as other programs and other machines leave them.
 
-use super::{Place, SMALL, png};
+use super::{Place, SIZE, SMALL, png};
 use raygrad::nerf::Image;
 use serde_json::{Value, json};
 
@@ -107,7 +107,14 @@ fn test_images_can_be_chosen() {
     place.succeeds("train --resume all --steps 2");
     assert_eq!(train("--test every:2", "half").len(), 5);
     place.succeeds("eval half");
-    assert_eq!(place.json("half/eval-test-fast.json")["views"], 6);
+    let result = place.json("half/eval-test-fast.json");
+    assert_eq!((&result["views"], &result["hold_out"]), (&json!(6), &json!("as `train --test` chose")));
+    // Few images fade in detail.
+    assert_eq!(place.json("half/config.json")["config"]["camera_optimizer"]["coarse"], 0.5);
+    place.succeeds("export half --to nerfstudio --out half-scene");
+    let lists = place.json("half-scene/transforms.json");
+    let count = |list: &str| lists[list].as_array().unwrap().len();
+    assert_eq!([count("train_filenames"), count("test_filenames")], [5, 6]);
     let chosen = train("--test r_3,val/r_1", "named");
     assert!(chosen.len() == 9 && !chosen.contains(&"train/r_3".to_owned()), "{chosen:?}");
     // A path along training images counts those of the run.
@@ -171,4 +178,32 @@ fn large_images_are_downscaled() {
     // Renders have the size of training.
     place.succeeds("render run --path test --out views");
     assert_eq!(png(&place.path("views/0000.png")).width, 1068);
+}
+
+#[test]
+fn masks_as_alpha_stay_in_all_commands() {
+    let place = plain();
+    let mut transforms = place.json("plain/transforms.json");
+    let mut mask = Image { width: SIZE, height: SIZE, channels: 1, data: vec![1.0; SIZE * SIZE] };
+    mask.data[..SIZE * SIZE / 2].fill(0.0);
+    mask.save_png(place.path("plain/mask.png")).unwrap();
+    for frame in transforms["frames"].as_array_mut().unwrap() {
+        frame["mask_path"] = json!("mask.png");
+    }
+    std::fs::write(place.path("plain/transforms.json"), transforms.to_string()).unwrap();
+    let psnr = |run: &str, flags: &str| {
+        place.succeeds(&format!("train plain --steps 2 --out {run} {SMALL} {flags}"));
+        place.succeeds(&format!("train --resume {run} --steps 4"));
+        place.succeeds(&format!("eval {run}"));
+        let result = place.json(&format!("{run}/eval-test-fast.json"));
+        (result["mask_as_alpha"].clone(), result["psnr_mean"].as_f64().unwrap())
+    };
+    let (ignored, cut) = (psnr("ignored", ""), psnr("cut", "--mask-as-alpha"));
+    assert_eq!((ignored.0, cut.0), (Value::Null, json!(true)));
+    assert!(ignored.1 != cut.1);
+    // A run of as many steps, without a stop, is the same.
+    place.succeeds(&format!("train plain --steps 4 --out whole {SMALL} --mask-as-alpha"));
+    assert!(place.bytes("cut/model.safetensors") == place.bytes("whole/model.safetensors"));
+    let said = said(&place, "compare ignored/eval-test-fast.json cut/eval-test-fast.json");
+    assert!(said.contains("mask_as_alpha"), "{said}");
 }

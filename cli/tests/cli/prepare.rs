@@ -721,6 +721,11 @@ fn heic_images_become_upright_jpegs() {
         }
         // raygrad itself turns this one.
         assert_eq!(Photo::size_of_file(place.path("made/images/7.jpg")).unwrap(), [[8, 16]; 2]);
+        // The converted images are those of the folder.
+        std::fs::rename(place.path("made"), place.path("photos-prepared")).unwrap();
+        let said = String::from_utf8(command(&place, "train photos --steps 1").output().unwrap().stdout).unwrap();
+        assert!(said.starts_with("prepared photos-prepared, made before from photos\n"), "{said}");
+        std::fs::rename(place.path("photos-prepared"), place.path("made")).unwrap();
         let left = std::fs::read_dir(place.path("made")).unwrap().map(|entry| entry.unwrap().file_name());
         assert!(left.into_iter().all(|name| !name.to_str().unwrap().starts_with("heif")));
     }

@@ -322,6 +322,44 @@ mod tests {
     }
 
     #[test]
+    fn rectified_silhouettes_equal_those_of_each_lens() {
+        // Wide images that are not square, off their centre, with an object in one corner.
+        let frame = |lens: Lens| {
+            let mut image = Image::new(90, 60, 4);
+            let pose = Camera::look_at(DVec3::new(0.0, 0.0, 10.0), DVec3::ZERO, DVec3::Y);
+            let camera =
+                Camera { lens, focal: [80.0, 70.0], centre: [40.0, 33.0], ..Camera::from_angle(90, 60, 1.0, pose) };
+            for y in 0..60 {
+                for x in 0..90 {
+                    let d = camera.ray(x as f64 + 0.5, y as f64 + 0.5).direction;
+                    let at = [d.x / -d.z, d.y / -d.z];
+                    let is_object = (0.1..0.3).contains(&at[0]) && (0.05..0.15).contains(&at[1]);
+                    image.pixel_mut(x, y)[3] = f32::from(u8::from(is_object));
+                }
+            }
+            Frame { name: String::new(), camera, image: image.into(), mask: None, distances: None }
+        };
+        let mut rectified = vec![];
+        let frames = [Lens::Pinhole, lenses()[1], lenses()[3], lenses()[1]].map(frame);
+        let all = frames.each_ref().map(|frame| Silhouette::new(frame, &mut rectified).unwrap());
+        assert_eq!(rectified.len(), 2, "images of one camera share a map");
+        let (mut same, mut clear) = (0, 0);
+        for i in 0..40 {
+            for j in 0..40 {
+                let centre = DVec3::new(-5.0 + 0.25 * i as f64, -4.0 + 0.2 * j as f64, 0.0);
+                let seen = all.each_ref().map(|silhouette| silhouette.is_clear(centre, 0.1));
+                same += usize::from(seen == [seen[0]; 4]);
+                clear += usize::from(seen[0]);
+                let at = centre / 10.0;
+                let is_object = (0.1..0.3).contains(&at.x) && (0.05..0.15).contains(&at.y);
+                assert!(!is_object || seen == [false; 4], "{centre}");
+            }
+        }
+        // They differ along borders alone.
+        assert!(same > 1250 && (700..1300).contains(&clear), "{same} {clear}");
+    }
+
+    #[test]
     fn carving_through_a_lens_leaves_as_much_as_a_pinhole() {
         let kept = |lens: Lens| {
             let views = [view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y), view(DVec3::new(10.0, 0.0, 0.0), DVec3::Y)];

@@ -94,6 +94,12 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>) -> Result<Cap
         let what = "does not describe a capture: name a folder, a .json file, poses_bounds.npy, or images.bin of a COLMAP \
                     model";
         let description = Description::of_file(path).ok_or_else(|| Error::file(path, what))?;
+        if let Some(asked) = asked.filter(|asked| *asked != description.format) {
+            return Err(Error::file(
+                path,
+                format!("describes a capture in the format {}, not {asked}", description.format),
+            ));
+        }
         return description.read();
     }
     let mut all = descriptions(path);
@@ -146,7 +152,8 @@ fn unknown(folder: &Path, asked: Option<Format>) -> Error {
         let found = if found.is_empty() { "no capture".to_owned() } else { found.join(", ") };
         return Error::file(folder, format!("holds no capture in the format {format}, but {found}"));
     }
-    if let Some(parent) = folder.parent().filter(|parent| !descriptions(parent).is_empty()) {
+    let whole = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
+    if let Some(parent) = whole.parent().filter(|parent| !descriptions(parent).is_empty()) {
         return Error::file(folder, format!("is not a dataset, but `{}` is: use that folder", parent.display()));
     }
     if let Some((_, what, remedy)) = EXPORTS.iter().find(|(name, ..)| folder.join(name).exists()) {

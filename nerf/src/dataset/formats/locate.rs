@@ -18,6 +18,8 @@ const MOST_ENTRIES: usize = 200_000;
 const SPLITS: [&str; 4] = ["train", "val", "eval", "test"];
 /// Words in the names of folders with other files than images.
 const LAYERS: [&str; 4] = ["mask", "depth", "normal", "segment"];
+/// The last parts of a listed path that state its kind; those before are the user's.
+const STATED: usize = 2;
 
 /// A file of a capture.
 #[derive(Debug, Clone, PartialEq)]
@@ -198,10 +200,11 @@ fn best<'a>(folder: &Path, place: &str, directories: impl Iterator<Item = &'a Di
     let wanted: Vec<String> = place.split('/').filter(|part| !matches!(*part, "" | "." | "..")).map(lower).collect();
     let splits = |parts: &[String]| SPLITS.map(|split| parts.iter().any(|part| part == split));
     let layers = |parts: &[String]| LAYERS.map(|layer| parts.iter().any(|part| part.contains(layer)));
+    let stated = layers(&wanted[wanted.len().saturating_sub(STATED)..]);
     let rate = |directory: &Directory| {
         let own = parts(&directory.inside);
         let is_of_split = splits(&own).iter().zip(splits(&wanted)).all(|(own, wanted)| *own <= wanted);
-        let is_of_kind = is_of_split && layers(&own) == layers(&wanted);
+        let is_of_kind = is_of_split && layers(&own) == stated;
         let path = [parts(&root), own].concat();
         let common = path.iter().rev().zip(wanted.iter().rev()).take_while(|(a, b)| a == b).count();
         is_of_kind.then_some((common, Reverse(factor_of(&directory.inside))))

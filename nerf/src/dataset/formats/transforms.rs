@@ -44,7 +44,8 @@ pub fn read(folder: &Path) -> Result<Capture> {
 pub(super) fn read_file(folder: &Path, file: &Path) -> Result<Capture> {
     let document = json::read(file)?;
     let top = Object::top(file, &document)?;
-    let Frames { views, left_out, assumptions, .. } = Frames::read(&[top.clone()], folder, Dialect::Transforms)?;
+    let Frames { views, left_out, assumptions, .. } =
+        Frames::read(std::slice::from_ref(&top), folder, Dialect::Transforms)?;
     let mut views: Vec<View> = views.into_iter().flatten().collect();
     read_splits(&top, &mut views, &left_out)?;
     let scale = top.positive("applied_scale")?.unwrap_or(1.0);

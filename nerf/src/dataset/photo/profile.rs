@@ -12,7 +12,7 @@ pub(super) enum Profile {
     /// sRGB, up to the rounding of profiles; also without a profile.
     Srgb,
     /// RGB colours with a matrix and three transfer curves.
-    Rgb(RgbSpace),
+    Rgb(Box<RgbSpace>),
     /// A damaged profile, or one of another kind: lookup tables, grey or CMYK. Colours count as sRGB.
     Unread,
 }
@@ -24,7 +24,7 @@ impl Profile {
             Ok(None) => Profile::Srgb,
             Ok(Some(bytes)) => match RgbSpace::parse(&bytes) {
                 Some(space) if space.is_srgb() => Profile::Srgb,
-                Some(space) => Profile::Rgb(space),
+                Some(space) => Profile::Rgb(Box::new(space)),
                 None => Profile::Unread,
             },
             Err(_) => Profile::Unread,

@@ -107,7 +107,9 @@ mod tests {
         };
         let size =
             |[width, height]: [u32; 2]| [b"ispe\0\0\0\0", &width.to_be_bytes()[..], &height.to_be_bytes()].concat();
-        let heic = [b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", &size([512, 512])[..], &size([4032, 3024])].concat();
+        let heic =
+            [b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", &size([512, 512])[..], &size([4032, 3024]), &size([320, 240])]
+                .concat();
         assert_eq!(of(&heic), Some([4032, 3024]));
         assert_eq!(of(b"\0\0\0\x18ftypABCD\0\0\0\0MiHEavif"), Some([0, 0]), "a compatible brand");
         for other in [

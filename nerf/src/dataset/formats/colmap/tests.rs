@@ -445,3 +445,22 @@ fn images_are_found_in_other_folders_and_spellings() {
     assert_eq!(images[1], Some(folder.path().join("photos/b/second.png")));
     assert_eq!(assumptions.len(), 2, "{assumptions:?}");
 }
+
+#[test]
+fn distorted_models_have_the_images_of_input() {
+    let folder = folder(Encoding::Text, "distorted/sparse/0", &text());
+    for name in ["images/a.png", "input/a.png", "images/b/second.png", "input/b/second.png"] {
+        let path = folder.path().join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, "").unwrap();
+    }
+    let input = Some(folder.path().join("input/a.png"));
+    assert_eq!(read(folder.path()).unwrap().views[0].image, input);
+    // The folder of the model, by itself and by a file.
+    let model = folder.path().join("distorted/sparse/0");
+    assert_eq!(root(&model), folder.path());
+    assert_eq!(root(&folder.path().join("sparse/0")), folder.path());
+    assert_eq!(root(&folder.path().join("colmap/sparse/0")), folder.path());
+    assert_eq!(root(&folder.path().join("other")), folder.path().join("other"));
+    assert_eq!(read(&model).unwrap().views[0].image, input);
+}

@@ -105,6 +105,9 @@ fn files_name_their_description() {
         assert_eq!(count(file), expected, "{file}");
     }
     assert_eq!(read(&path.join("sparse/3"), None).unwrap().present().count(), 2, "a model's folder");
+    let message = read(&path.join("some.json"), Some(Format::Llff)).unwrap_err().to_string();
+    assert!(message.ends_with("some.json: describes a capture in the format transforms.json, not LLFF"), "{message}");
+    assert!(read(&path.join("sparse/3/images.bin"), Some(Format::Colmap)).is_ok());
     let message = read(&path.join("images/0.png"), None).unwrap_err().to_string();
     assert!(message.contains("images/0.png: does not describe a capture: name a folder"), "{message}");
     write(path, Format::Blender, [1, 1], 0);

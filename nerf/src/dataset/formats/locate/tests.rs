@@ -46,7 +46,8 @@ fn listed_files_come_first() {
 #[test]
 fn folders_are_found_by_the_end_of_the_path() {
     let files = ["images/frame_1.jpg", "images/frame_2.jpg", "transforms.json"];
-    for place in ["../slike", "C:/data", "/home/someone/data/images", "scene/images", "scene", "", "a/b/images"] {
+    let places = ["../slike", "C:/data", "/home/someone/data/images", "scene/images", "scene", "", "a/b/images"];
+    for place in places.into_iter().chain(["D:/depth-scans/mine/images", "/train/normal/mine/images"]) {
         let names = ["frame_1.jpg", "frame_2.jpg"].map(|name| format!("{place}/{name}"));
         let names = names.each_ref().map(|name| name.trim_start_matches('/'));
         let names =

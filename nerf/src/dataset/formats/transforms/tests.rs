@@ -377,3 +377,18 @@ fn downscaled_images_keep_the_scale_of_focal_lengths() {
     picture(&folder.path().join("images_2/0.png"), 4, 3);
     assert_eq!(camera(folder.path()), plain);
 }
+
+#[test]
+fn half_of_the_frames_must_have_a_pose_and_lists_may_name_the_others() {
+    let with = |count: usize, bad: usize| {
+        let folder = folder(|d| {
+            let names: Vec<String> = (0..count).map(|i| format!("images/{i}.png")).collect();
+            d["frames"] = frames(&names.iter().map(String::as_str).collect::<Vec<_>>());
+            (0..bad).for_each(|i| d["frames"][i]["transform_matrix"][0][3] = json!("nan"));
+            d["train_filenames"] = json!(names);
+        });
+        read(folder.path())
+    };
+    assert_eq!(with(5, 2).unwrap().views.len(), 3);
+    says(&failure(with(4, 2), FILE), &["`frames[0].transform_matrix`", "row 0, column 3 is not a finite number"]);
+}

@@ -37,10 +37,20 @@ fn srgb_table(count: usize) -> Vec<u8> {
 
 /// A profile with these columns of the matrix, and one curve for all channels.
 fn profile(columns: [[f64; 3]; 3], curve: &[u8]) -> Vec<u8> {
+    profile_of(columns, [curve; 3])
+}
+
+fn profile_of(columns: [[f64; 3]; 3], curves: [&[u8]; 3]) -> Vec<u8> {
     let colors = columns.map(|column| [b"XYZ \0\0\0\0".as_slice(), &fixed_bytes(&column)].concat());
     let [red, green, blue] = &colors;
-    let tags: [(&[u8; 4], &[u8]); 6] =
-        [(b"rXYZ", red), (b"rTRC", curve), (b"gXYZ", green), (b"gTRC", curve), (b"bXYZ", blue), (b"bTRC", curve)];
+    let tags: [(&[u8; 4], &[u8]); 6] = [
+        (b"rXYZ", red),
+        (b"rTRC", curves[0]),
+        (b"gXYZ", green),
+        (b"gTRC", curves[1]),
+        (b"bXYZ", blue),
+        (b"bTRC", curves[2]),
+    ];
     let mut bytes = vec![0; 128];
     bytes[16..24].copy_from_slice(b"RGB XYZ ");
     bytes[36..40].copy_from_slice(b"acsp");
@@ -133,7 +143,7 @@ const TYPES: [&str; 4] = ["png", "png16", "jpg", "webp"];
 #[test]
 fn images_are_converted_by_their_profiles() {
     let p3 = profile(P3, &srgb_curve());
-    let space = Profile::Rgb(RgbSpace::parse(&p3).unwrap());
+    let space = Profile::Rgb(Box::new(RgbSpace::parse(&p3).unwrap()));
     for ending in TYPES {
         let (_folder, path) = written(ending, Some(&p3));
         let (_plain, plain) = written(ending, None);
@@ -260,5 +270,18 @@ fn damaged_profiles_are_harmless() {
     assert!((500..3500).contains(&read), "{read} of 4000 are read");
     for end in 0..whole[0].len() {
         assert!(RgbSpace::parse(&whole[0][..end]).is_none());
+    }
+}
+
+#[test]
+fn each_channel_has_its_own_curve() {
+    let gamma = |tenths: u16| [&b"curv\0\0\0\0\0\0\0\x01"[..], &(tenths * 256 / 10).to_be_bytes()].concat();
+    let [one, two, three] = [10, 20, 30].map(gamma);
+    let space = RgbSpace::parse(&profile_of(srgb_columns(), [&one, &two, &three])).unwrap();
+    let mut pixel = [32768_u16; 3];
+    space.convert(&mut pixel, 3, 65535, |value| value);
+    for (value, linear) in pixel.into_iter().zip([0.5, 0.25, 0.125]) {
+        let exact = SrgbEncode.f([linear]);
+        assert!((f64::from(value) / 65535.0 - exact).abs() < 2e-3, "{pixel:?}");
     }
 }
