@@ -449,12 +449,13 @@ pub(super) fn open(path: &Path, camera: &Camera) -> Result<Photo> {
 /// the image itself.
 fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize) {
     let inside = path.strip_prefix(folder).unwrap_or(Path::new(""));
+    // The capture itself refers to downscaled images.
+    let factor = formats::factor_of(inside);
+    if factor > 1 {
+        return (path.to_owned(), downscale.div_ceil(factor));
+    }
     let mut parts = inside.components();
     let first = parts.next().and_then(|part| part.as_os_str().to_str()).unwrap_or("");
-    // The capture itself refers to downscaled images.
-    if let Some(factor) = first.strip_prefix("images_").and_then(|factor| factor.parse::<usize>().ok()) {
-        return (path.to_owned(), if factor > 0 { downscale.div_ceil(factor) } else { downscale });
-    }
     if downscale == 1 || first != "images" {
         return (path.to_owned(), downscale);
     }
@@ -497,6 +498,8 @@ pub(crate) fn mask_fits(mask: [usize; 2], image: [usize; 2]) -> bool {
 /// Reads a mask (white for used pixels) of an image of the size `of`, resampled to the size `to`.
 fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Photo> {
     let mask = Photo::open(path, Some(of))?;
+    // Transparent pixels are black, whatever their colour.
+    let mask = if mask.has_alpha() { mask.to_image().over([0.0; 3]).into() } else { mask };
     let from = [mask.width, mask.height];
     if !mask_fits(from, of) {
         let what =

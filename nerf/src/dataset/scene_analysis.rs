@@ -42,6 +42,8 @@ const CONVENTION: [f64; 2] = [2.5, 5.5];
 const MARGIN: f64 = 0.01;
 /// The default near plane of an unbounded scene, as a share of the cameras' distance from its centre.
 const NEAR_SHARE: f64 = 0.05;
+/// The least near plane of a bounded scene, as a share of the cameras' usual distance from its centre.
+const LEAST_NEAR: f64 = 0.01;
 /// The far plane of an unbounded scene, in sides of its box.
 const FAR_SIDES: f64 = 1000.0;
 /// Half of the box of an unbounded scene, as a share of the cameras' distance from its centre.
@@ -160,13 +162,15 @@ fn conventional(cameras: &[&Camera]) -> bool {
 }
 
 /// The near and far plane of a bounded scene: the distances between which rays from the eyes, in any direction, can be in
-/// the box; near is 0 if an eye is inside.
+/// the box. Near is at least a share of the usual distance, also if an eye is inside.
 fn around_box(eyes: impl Iterator<Item = DVec3>, [low, high]: [DVec3; 2]) -> [f64; 2] {
-    let [near, far] = eyes.fold([f64::INFINITY, 0.0], |[near, far], eye| {
+    let eyes: Vec<DVec3> = eyes.collect();
+    let [near, far] = eyes.iter().fold([f64::INFINITY, 0.0], |[near, far], &eye| {
         let corner = (eye - low).abs().max((eye - high).abs());
         [near.min(eye.distance(eye.clamp(low, high))), far.max(corner.length())]
     });
-    [(1.0 - MARGIN) * near, (1.0 + MARGIN) * far]
+    let usual = median(eyes.iter().map(|eye| eye.distance(0.5 * (low + high))));
+    [((1.0 - MARGIN) * near).max(LEAST_NEAR * usual), (1.0 + MARGIN) * far]
 }
 
 /// The position and size of the scene, from the cameras' arrangement.

@@ -49,10 +49,19 @@ impl Frames {
         for frame in &all {
             frame.required("file_path")?;
         }
-        let mut images = files(&all, "file_path", folder, &mut out.assumptions)?.into_iter();
+        // A mask or depth that stands beside the images is no image.
+        let mut taken = HashSet::new();
+        for member in ["mask_path", "depth_file_path", "depth_path"] {
+            let named = |frame: &&Object<'_>| paths::normal(frame, member, frame.get(member)?).ok();
+            taken.extend(all.iter().filter_map(named).filter_map(|name| paths::find(folder, &name)));
+        }
+        let images = files(&all, "file_path", folder, &taken, &mut out.assumptions)?;
+        let taken: HashSet<PathBuf> =
+            images.iter().flatten().filter_map(|(_, image)| Some(image.as_ref()?.path.clone())).collect();
+        let mut images = images.into_iter();
         for (top, frames) in tops.iter().zip(&frames) {
             let images: Vec<_> = images.by_ref().take(frames.len()).flatten().collect();
-            let views = out.document(top, frames, &images, folder, dialect)?;
+            let views = out.document(top, frames, &images, (folder, &taken), dialect)?;
             out.views.push(views);
         }
         if let Some(name) = out.left_out.iter().min() {
@@ -71,13 +80,13 @@ impl Frames {
         top: &Object<'_>,
         frames: &[Object<'_>],
         images: &[Named],
-        folder: &Path,
+        (folder, taken): (&Path, &HashSet<PathBuf>),
         dialect: Dialect,
     ) -> Result<Vec<View>> {
         let layers: Vec<Layers<'_, '_>> = frames.iter().map(|frame| Layers { top, frame }).collect();
         let all: Vec<&Object<'_>> = frames.iter().collect();
-        let masks = files(&all, "mask_path", folder, &mut self.assumptions)?;
-        let depths = Depths::of(top, &all, folder, &mut self.assumptions)?;
+        let masks = files(&all, "mask_path", folder, taken, &mut self.assumptions)?;
+        let depths = Depths::of(top, &all, (folder, taken), &mut self.assumptions)?;
         let first = frames.iter().zip(images).find_map(|(frame, (_, image))| Some((frame, image.as_ref()?)));
         let mut common = None;
         let mut views = Vec::with_capacity(frames.len());
@@ -121,12 +130,13 @@ fn files(
     frames: &[&Object<'_>],
     member: &str,
     folder: &Path,
+    taken: &HashSet<PathBuf>,
     assumptions: &mut Vec<String>,
 ) -> Result<Vec<Option<Named>>> {
     let name = |frame: &&Object<'_>| frame.get(member).map(|value| paths::normal(frame, member, value)).transpose();
     let names = frames.iter().map(name).collect::<Result<Vec<Option<String>>>>()?;
     let listed: Vec<usize> = (0..frames.len()).filter(|&i| names[i].is_some()).collect();
-    let found = locate(folder, &names.iter().flatten().map(String::as_str).collect::<Vec<_>>(), assumptions);
+    let found = locate(folder, &names.iter().flatten().map(String::as_str).collect::<Vec<_>>(), taken, assumptions);
     let mut found = found.map_err(|(i, what)| frames[listed[i]].error(member, what))?.into_iter();
     Ok(names.into_iter().map(|name| Some((name?, found.next().flatten()))).collect())
 }
@@ -160,12 +170,17 @@ struct Depths {
 }
 
 impl Depths {
-    fn of(top: &Object<'_>, frames: &[&Object<'_>], folder: &Path, assumptions: &mut Vec<String>) -> Result<Self> {
-        let nerfstudio = files(frames, "depth_file_path", folder, assumptions)?;
+    fn of(
+        top: &Object<'_>,
+        frames: &[&Object<'_>],
+        (folder, taken): (&Path, &HashSet<PathBuf>),
+        assumptions: &mut Vec<String>,
+    ) -> Result<Self> {
+        let nerfstudio = files(frames, "depth_file_path", folder, taken, assumptions)?;
         let unit = top.number("integer_depth_scale")?.filter(|scale| *scale > 0.0);
         let is_used = top.flag("enable_depth_loading")? != Some(false);
         let ngp = match unit.filter(|_| is_used) {
-            Some(_) => files(frames, "depth_path", folder, assumptions)?,
+            Some(_) => files(frames, "depth_path", folder, taken, assumptions)?,
             None => vec![None; frames.len()],
         };
         Ok(Depths { nerfstudio, ngp, ngp_unit: unit.unwrap_or(1.0) })

@@ -32,6 +32,9 @@ const NOT_READ: [&str; 14] = [
 /// Names of a 3x3 intrinsic matrix: focal lengths on the diagonal, the principal point in the last column.
 const MATRICES: [&str; 5] = ["K", "intrinsics", "camera_intrinsics", "intrinsic_matrix", "camera_matrix"];
 
+/// The least focal length of such a matrix, as a share of the image's side: some matrices are in units of the side.
+const SHORTEST: f64 = 0.05;
+
 /// The largest difference of two values of a length, in pixels.
 const SAME: f64 = 0.01;
 
@@ -176,7 +179,13 @@ fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Opt
     let matrix = matrix_of(object)?;
     let axis = |length: &str, angle: &str, side: usize| {
         let of_matrix = matrix.map(|matrix| matrix[usize::from(length == "fl_y")]);
-        if let Some(f) = agreeing(object, length, object.number(length)?, of_matrix)? {
+        let own = object.number(length)?;
+        if let Some(f) = agreeing(object, length, own, of_matrix)? {
+            if own.is_none() && f < SHORTEST * side as f64 {
+                let what =
+                    format!("is {f} in the intrinsic matrix, which must be in pixels, of an image {side} wide or high");
+                return Err(object.error(length, what));
+            }
             if !FOCAL.contains(&f) {
                 return Err(object.error(length, format!("must be a focal length in pixels, 1e-3 to 1e9, is {f}")));
             }
@@ -202,10 +211,13 @@ fn matrix_of(object: &Object<'_>) -> Result<Option<[f64; 4]>> {
     else {
         return Ok(None);
     };
-    let entries: Option<Vec<f64>> = entries(value, 3).and_then(|entries| entries.into_iter().map(number).collect());
-    let matrix = entries.filter(|m| m.len() == 9 && m.iter().all(|x| x.is_finite()));
-    let what = || format!("must be a 3x3 intrinsic matrix, is {}", shown(value));
-    let m: [f64; 9] = matrix.and_then(|m| m.try_into().ok()).ok_or_else(|| object.error(name, what()))?;
+    // Lists of other shapes belong to other programs.
+    let Some(entries) = entries(value, 3).filter(|entries| entries.len() == 9) else { return Ok(None) };
+    let m: Option<Vec<f64>> = entries.into_iter().map(number).collect();
+    let m: Option<[f64; 9]> = m.filter(|m| m.iter().all(|x| x.is_finite())).and_then(|m| m.try_into().ok());
+    let Some(m) = m else {
+        return Err(object.error(name, format!("must be a 3x3 intrinsic matrix, is {}", shown(value))));
+    };
     // Some programs store columns. Only the principal point can stand outside of the diagonal.
     let ([fx, fy], skew, rest) = ([m[0], m[4]], [m[1], m[3]], m[8]);
     let [right, below] = [[m[2], m[5]], [m[6], m[7]]];

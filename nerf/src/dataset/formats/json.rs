@@ -10,7 +10,7 @@ use std::path::Path;
 const SHOWN: usize = 40;
 
 /// Names of members that some programs use in place of instant-ngp's.
-const OTHER_NAMES: [(&str, &str); 4] = [("fl_x", "fx"), ("fl_y", "fy"), ("w", "width"), ("h", "height")];
+const OTHER_NAMES: [(&str, &str); 2] = [("w", "width"), ("h", "height")];
 
 /// A number, also as a string, as some programs write it.
 pub(super) fn number(value: &Value) -> Option<f64> {

@@ -13,6 +13,8 @@ use crate::dataset::capture::{Capture, Format, View};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use glam::{DAffine3, DMat3, DVec3};
+use std::collections::BTreeSet;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 const FILE: &str = "poses_bounds.npy";
@@ -53,7 +55,7 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
     let (count, mut assumptions) = (images.len(), vec![]);
     let mut images: Vec<(String, Option<PathBuf>)> =
         images.into_iter().map(|(name, path)| (name, Some(path))).collect();
-    if matrix.rows != count {
+    if matrix.rows != count || is_other_list(folder, matrix.rows, &images) {
         images = listed(folder, matrix.rows, images)?;
         assumptions.push(format!("took the {} images that `{LIST}` lists, of {count}", matrix.rows));
     }
@@ -79,6 +81,25 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
     Ok(Capture { assumptions, ..Capture::new(folder, file, Format::Llff, views) })
 }
 
+/// The names that `view_imgs.txt` lists, without folders.
+fn list(text: &str) -> Vec<&str> {
+    let names = text.trim_start_matches('\u{feff}').lines().map(|line| line.trim().rsplit(['/', '\\']).next());
+    names.flatten().filter(|name| !name.is_empty()).collect()
+}
+
+/// A file name in lower case, without its extension.
+fn stem(name: &str) -> Option<OsString> {
+    Path::new(name).file_stem().map(|stem| stem.to_ascii_lowercase())
+}
+
+/// Returns true if `view_imgs.txt` lists an image for each row, and other images than the folder holds.
+fn is_other_list(folder: &Path, rows: usize, images: &[(String, Option<PathBuf>)]) -> bool {
+    let Ok(text) = std::fs::read_to_string(folder.join(LIST)) else { return false };
+    let names = list(&text);
+    let listed: BTreeSet<_> = names.iter().copied().map(stem).collect();
+    names.len() == rows && listed != images.iter().map(|(name, _)| stem(name)).collect()
+}
+
 /// The images of the rows, as `view_imgs.txt` lists them.
 fn listed(
     folder: &Path,
@@ -98,8 +119,7 @@ fn listed(
         return Err(Error::field(folder.join(FILE), "shape", what));
     }
     let text = std::fs::read_to_string(&file).map_err(|e| Error::file(&file, format!("cannot be read: {e}")))?;
-    let names = text.trim_start_matches('\u{feff}').lines().map(|line| line.trim().rsplit(['/', '\\']).next());
-    let names: Vec<&str> = names.flatten().filter(|name| !name.is_empty()).collect();
+    let names = list(&text);
     if names.len() != rows {
         return bad(format!("has {} names, but {FILE} has {rows} rows: list the image of each row", names.len()));
     }
@@ -114,7 +134,6 @@ fn listed(
             ),
         });
     }
-    let stem = |name: &str| Path::new(name).file_stem().map(|stem| stem.to_ascii_lowercase());
     // Downscaled images may have another extension.
     let found = |name: &str| {
         let exact = images.iter().find(|(own, _)| own == name);

@@ -32,7 +32,8 @@ pub(super) struct Located {
 /// A name's index and a message.
 pub(super) type Ambiguity = (usize, String);
 
-/// Finds the files with these names, relative to `folder`; `None` for those that do not exist.
+/// Finds the files with these names, relative to `folder`; `None` for those that do not exist. Files of `taken` belong
+/// to others, such as masks.
 ///
 /// Adds a sentence to `assumptions` for each listed folder whose files were found elsewhere.
 ///
@@ -41,6 +42,7 @@ pub(super) type Ambiguity = (usize, String);
 pub(super) fn locate(
     folder: &Path,
     names: &[&str],
+    taken: &HashSet<PathBuf>,
     assumptions: &mut Vec<String>,
 ) -> Result<Vec<Option<Located>>, Ambiguity> {
     let exact = |name: &&str| paths::find(folder, name).map(|path| Located { path, factor: 1 });
@@ -53,41 +55,42 @@ pub(super) fn locate(
     }
     // Files with an owner take no other name's place.
     let exact: HashSet<PathBuf> = found.iter().flatten().map(|file| file.path.clone()).collect();
+    let is_free = |path: &PathBuf| !exact.contains(path) && !taken.contains(path);
     let mut owners: HashMap<PathBuf, usize> = HashMap::new();
     let mut tree = None;
     for (place, group) in groups {
-        let directories = match existing.contains(place) {
-            true => vec![Directory::read(folder, Path::new(place))],
-            false => {
-                let tree = tree.get_or_insert_with(|| walk(folder));
-                let holds_any = |directory: &&Directory| group.iter().any(|&i| !directory.of(listed[i][1]).is_empty());
-                best(folder, place, tree.iter().filter(holds_any))
-            }
+        // Images with another extension, in a folder of which others exist as listed, are others.
+        let is_there = existing.contains(place);
+        let own;
+        let directories = if is_there {
+            own = Directory::read(folder, Path::new(place));
+            vec![&own]
+        } else {
+            let names: Vec<&str> = group.iter().map(|&i| listed[i][1]).collect();
+            tree.get_or_insert_with(|| Tree::new(folder)).best(place, &names)
         };
         let (mut first, mut count) = (None, 0);
         for i in group {
-            let mut fitting: Vec<(&Directory, &OsString)> = directories
-                .iter()
-                .flat_map(|directory| directory.of(listed[i][1]).into_iter().map(move |file| (directory, file)))
-                .filter(|(directory, file)| !exact.contains(&folder.join(&directory.inside).join(file)))
-                .collect();
-            let Some((directory, file)) = fitting.pop() else { continue };
-            let inside = directory.inside.join(file);
-            if let Some((other, file)) = fitting.pop() {
-                let other = other.inside.join(file);
-                let [one, two] = [&other, &inside].map(|path| path.display());
+            let of = |directory: &'_ Directory| -> Vec<PathBuf> {
+                let files = directory.of(listed[i][1], !is_there).into_iter();
+                files.map(|file| directory.inside.join(file)).filter(|file| is_free(&folder.join(file))).collect()
+            };
+            let mut fitting: Vec<PathBuf> = directories.iter().flat_map(|directory| of(directory)).collect();
+            let Some(file) = fitting.pop() else { continue };
+            if let Some(other) = fitting.pop() {
+                let [one, two] = [&other, &file].map(|path| path.display());
                 let what = format!("`{}` does not exist; `{one}` and `{two}` fit: correct the path", names[i]);
                 return Err((i, what));
             }
-            if let Some(&other) = owners.get(&inside).filter(|&&other| names[other] != names[i]) {
-                let (one, two, file) = (names[other], names[i], inside.display());
+            if let Some(&other) = owners.get(&file).filter(|&&other| names[other] != names[i]) {
+                let (one, two, file) = (names[other], names[i], file.display());
                 let what = format!("`{one}` and `{two}` do not exist; `{file}` fits both: correct the paths");
                 return Err((i, what));
             }
-            owners.insert(inside.clone(), i);
-            first.get_or_insert_with(|| (i, inside.display().to_string()));
+            owners.insert(file.clone(), i);
+            first.get_or_insert_with(|| (i, file.display().to_string()));
             count += 1;
-            found[i] = Some(Located { path: folder.join(inside), factor: factor_of(&directory.inside) });
+            found[i] = Some(Located { path: folder.join(&file), factor: factor_of(&file) });
         }
         if let Some((i, file)) = first {
             let rest = match count - 1 {
@@ -140,14 +143,14 @@ impl Directory {
         Directory::new(inside.to_owned(), names)
     }
 
-    /// The files that fit a name best: of the same name, or else in other letter case, or else with the extension of
-    /// another image format.
-    fn of(&self, name: &str) -> Vec<&OsString> {
+    /// The files that fit a name best: of the same name, or else in other letter case, or else, if `others` is true,
+    /// with the extension of another image format.
+    fn of(&self, name: &str, others: bool) -> Vec<&OsString> {
         let all = self.files.get(&stem(name)).map_or(&[][..], Vec::as_slice);
         let fits = |test: &dyn Fn(&str) -> bool| -> Vec<&OsString> {
             all.iter().filter(|file| test(&file.to_string_lossy())).collect()
         };
-        let is_image = |file: &str| extension(file).is_some();
+        let is_image = |file: &str| others && extension(file).is_some();
         let rules: [&dyn Fn(&str) -> bool; 3] =
             [&|file| file == name, &|file| file.to_lowercase() == name.to_lowercase(), &is_image];
         rules.into_iter().map(fits).find(|files| !files.is_empty()).unwrap_or_default()
@@ -158,7 +161,62 @@ fn is_hidden(name: &std::ffi::OsStr) -> bool {
     name.as_encoded_bytes().starts_with(b".")
 }
 
-/// All folders below `folder`, itself included, in the order of their paths. Hidden entries are left out.
+/// All folders of a capture, itself included, in the order of their paths. Hidden entries are left out.
+struct Tree {
+    /// The parts of the path of the capture's folder.
+    root: Vec<String>,
+    directories: Vec<Directory>,
+    /// The indices of the folders with a stem.
+    holders: HashMap<String, Vec<usize>>,
+}
+
+impl Tree {
+    fn new(folder: &Path) -> Self {
+        let root = parts(&std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned()));
+        let directories = walk(folder);
+        let mut holders: HashMap<String, Vec<usize>> = HashMap::new();
+        for (i, directory) in directories.iter().enumerate() {
+            directory.files.keys().for_each(|stem| holders.entry(stem.clone()).or_default().push(i));
+        }
+        Tree { root, directories, holders }
+    }
+
+    /// The folders for the names of the listed folder `place`, whose paths have the longest common end with it; several
+    /// if they are equally long. Without a common part, a folder must hold most names.
+    ///
+    /// A folder `images_4` counts as `images`, after folders of full size; the least downscaled counts.
+    fn best(&self, place: &str, names: &[&str]) -> Vec<&Directory> {
+        let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
+        for name in names {
+            for holder in self.holders.get(&stem(name)).into_iter().flatten() {
+                *counts.entry(*holder).or_default() += 1;
+            }
+        }
+        let wanted: Vec<String> =
+            place.split('/').filter(|part| !matches!(*part, "" | "." | "..")).map(lower).collect();
+        let splits =
+            |parts: &[String]| SPLITS.map(|split| parts.iter().any(|part| words(part).any(|word| word == split)));
+        let layers = |parts: &[String]| LAYERS.map(|layer| parts.iter().any(|part| part.contains(layer)));
+        let stated = layers(&wanted[wanted.len().saturating_sub(STATED)..]);
+        let rate = |directory: &Directory, count: usize| {
+            let own = parts(&directory.inside);
+            let is_of_split = splits(&own).iter().zip(splits(&wanted)).all(|(own, wanted)| *own <= wanted);
+            let is_of_kind = is_of_split && layers(&own) == stated;
+            let path = self.root.iter().chain(&own);
+            let common = path.rev().zip(wanted.iter().rev()).take_while(|(a, b)| a == b).count();
+            (is_of_kind && (common > 0 || 2 * count > names.len()))
+                .then_some((common, Reverse(factor_of(&directory.inside))))
+        };
+        let rated: Vec<_> = counts
+            .into_iter()
+            .filter_map(|(i, count)| Some((rate(&self.directories[i], count)?, &self.directories[i])))
+            .collect();
+        let most = rated.iter().map(|(rating, _)| *rating).max();
+        rated.into_iter().filter(|(rating, _)| Some(*rating) == most).map(|(_, directory)| directory).collect()
+    }
+}
+
+/// All folders below `folder`, itself included, in the order of their paths.
 fn walk(folder: &Path) -> Vec<Directory> {
     let (mut out, mut seen, mut entries) = (vec![], HashSet::new(), 0);
     let mut waiting = VecDeque::from([(PathBuf::new(), 0)]);
@@ -171,10 +229,11 @@ fn walk(folder: &Path) -> Vec<Directory> {
         let mut names = vec![];
         for entry in std::fs::read_dir(&here).into_iter().flatten().flatten() {
             entries += 1;
-            let name = entry.file_name();
+            // Of a larger folder, a file that fits might not be the only one.
             if entries > MOST_ENTRIES {
-                break;
+                return vec![];
             }
+            let name = entry.file_name();
             if is_hidden(&name) {
                 continue;
             }
@@ -192,26 +251,9 @@ fn walk(folder: &Path) -> Vec<Directory> {
     out
 }
 
-/// The folders whose paths have the longest common end with `place`; several if they are equally long.
-///
-/// A folder `images_4` counts as `images`, after folders of full size; the least downscaled counts.
-fn best<'a>(folder: &Path, place: &str, directories: impl Iterator<Item = &'a Directory>) -> Vec<Directory> {
-    let root = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
-    let wanted: Vec<String> = place.split('/').filter(|part| !matches!(*part, "" | "." | "..")).map(lower).collect();
-    let splits = |parts: &[String]| SPLITS.map(|split| parts.iter().any(|part| part == split));
-    let layers = |parts: &[String]| LAYERS.map(|layer| parts.iter().any(|part| part.contains(layer)));
-    let stated = layers(&wanted[wanted.len().saturating_sub(STATED)..]);
-    let rate = |directory: &Directory| {
-        let own = parts(&directory.inside);
-        let is_of_split = splits(&own).iter().zip(splits(&wanted)).all(|(own, wanted)| *own <= wanted);
-        let is_of_kind = is_of_split && layers(&own) == stated;
-        let path = [parts(&root), own].concat();
-        let common = path.iter().rev().zip(wanted.iter().rev()).take_while(|(a, b)| a == b).count();
-        is_of_kind.then_some((common, Reverse(factor_of(&directory.inside))))
-    };
-    let rated: Vec<_> = directories.filter_map(|directory| Some((rate(directory)?, directory))).collect();
-    let most = rated.iter().map(|(rating, _)| *rating).max();
-    rated.into_iter().filter(|(rating, _)| Some(*rating) == most).map(|(_, directory)| directory.clone()).collect()
+/// The words of a folder's name.
+fn words(part: &str) -> impl Iterator<Item = &str> {
+    part.split(|c: char| !c.is_alphabetic())
 }
 
 fn lower(part: &str) -> String {
@@ -232,10 +274,10 @@ fn parts(path: &Path) -> Vec<String> {
         .collect()
 }
 
-/// The factor of a folder of downscaled images, such as `images_4`; 1 for other folders.
-fn factor_of(inside: &Path) -> usize {
-    let name = inside.components().next().map_or_else(Default::default, |part| part.as_os_str().to_string_lossy());
-    name.strip_prefix("images_").and_then(|factor| factor.parse().ok()).filter(|factor| *factor > 0).unwrap_or(1)
+/// The factor of a path in a folder of downscaled images, such as `images_4`; 1 for other paths.
+pub(in crate::dataset) fn factor_of(inside: &Path) -> usize {
+    let factor = |part: Component<'_>| part.as_os_str().to_str()?.strip_prefix("images_")?.parse().ok();
+    inside.components().find_map(factor).filter(|factor| *factor > 0).unwrap_or(1)
 }
 
 #[cfg(test)]

@@ -26,6 +26,7 @@ pub mod rigid;
 pub mod transforms;
 
 pub(super) use description::{is_described, read};
+pub(super) use locate::factor_of;
 
 #[cfg(test)]
 mod kit;

@@ -246,7 +246,7 @@ fn near_and_far_of_bounded_scenes_hold_the_box() {
     let mut inside = capture(Format::Transforms, quarter(4.0));
     inside.views[0].camera.pose.translation = CENTRE + DVec3::new(0.1, 0.2, 0.3);
     let inside = SceneAnalysis::new(&inside, Some("it is transparent"), None).unwrap();
-    assert_eq!(inside.near, 0.0);
+    assert!((0.001..0.1).contains(&inside.near), "{}", inside.near);
 }
 
 /// 5 x 5 cameras in a grid that look straight down from a height of 50 with one heading, and points on the ground. An

@@ -255,6 +255,7 @@ fn images_of_another_split_take_no_place() {
     let at = |name: &str| folder.path().join(name);
     std::fs::write(at("transforms_test.json"), document(&["test/r_0"]).to_string()).unwrap();
     picture(&at("unlisted/r_0.png"), 8, 6);
+    picture(&at("unlisted/r_1.png"), 8, 6);
     std::fs::rename(at("train"), at("val")).unwrap();
     // Two splits list the name, and a folder of another kind fits neither.
     says(

@@ -4,6 +4,7 @@ use super::super::locate::locate;
 use crate::dataset::capture::Capture;
 use crate::dataset::formats::masks;
 use crate::error::{Error, Result};
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 /// Names of image folders.
@@ -19,7 +20,7 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     // to the folder of the capture.
     let folders = IMAGES.map(|name| root.join(name));
     let mut images: Vec<PathBuf> = folders.into_iter().filter(|folder| folder.is_dir()).collect();
-    if model.components().any(|part| part.as_os_str() == "distorted") {
+    if model.strip_prefix(&root).is_ok_and(|inside| inside.starts_with("distorted")) {
         // 3D Gaussian Splatting keeps undistorted images in `images`, and those of this model in `input`.
         images.reverse();
     }
@@ -32,7 +33,7 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     };
     let names: Vec<String> = capture.views.iter().map(|view| format!("{below}{}", view.name)).collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
-    let found = locate(&folder, &names, &mut capture.assumptions);
+    let found = locate(&folder, &names, &HashSet::new(), &mut capture.assumptions);
     let found = found.map_err(|(i, what)| Error::field(&capture.file, &capture.views[i].field, what))?;
     capture.views.iter_mut().zip(found).for_each(|(view, image)| view.image = image.map(|image| image.path));
     masks::attach(capture, &[root]);

@@ -321,9 +321,8 @@ fn missing_sizes_come_from_the_images() {
 #[test]
 fn other_spellings_of_numbers_give_the_same_cameras() {
     let plain = cameras(|_| {});
-    let names = [("fl_x", "fx"), ("fl_y", "fy"), ("w", "width"), ("h", "height")];
     let renamed = cameras(|d| {
-        for (usual, other) in names {
+        for (usual, other) in [("w", "width"), ("h", "height")] {
             d[other] = d[usual].clone();
             remove(d, usual);
         }
@@ -373,9 +372,18 @@ fn intrinsic_matrices_are_read_in_all_forms() {
     ] {
         fails(|d| d["K"] = matrix, &["`K`: must have the rows fx 0 cx, 0 fy cy and 0 0 1"]);
     }
-    for matrix in [json!([]), json!([[100, 0, 31], [0, 110, 25]]), json!([1, 2, "x", 4, 5, 6, 7, 8, 9]), json!([[1]])] {
-        fails(|d| d["K"] = matrix, &["`K`: must be a 3x3 intrinsic matrix"]);
-    }
+    fails(|d| d["K"] = json!([1, 2, "x", 4, 5, 6, 7, 8, 9]), &["`K`: must be a 3x3 intrinsic matrix"]);
+    let of_sides = json!([[1.5, 0, 0.5], [0, 1.5, 0.5], [0, 0, 1]]);
+    fails(
+        |d| {
+            lengths.iter().for_each(|length| remove(d, length));
+            d["K"] = of_sides;
+        },
+        &["`fl_x`: is 1.5 in the intrinsic matrix, which must be in pixels, of an image 64 wide"],
+    );
     // Other programs' members of these names.
+    for other in [json!([]), json!([[100, 0, 31], [0, 110, 25]]), json!([[1]]), json!([[1, 2, 3, 4]])] {
+        assert_eq!(cameras(|d| d["K"] = other), plain);
+    }
     assert_eq!(cameras(|d| d["intrinsics"] = json!({ "fx": 1 })), plain);
 }

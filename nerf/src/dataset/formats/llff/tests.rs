@@ -147,6 +147,8 @@ fn list_names_the_images_of_the_rows() {
     let folder = folder(&npy(&ROWS), &images);
     let message = read(folder.path()).unwrap_err().to_string();
     assert!(message.contains("has 2 rows, but there are 3 images in ") && message.contains(LIST), "{message}");
+    // As many images as rows, but others.
+    good("a.png\nb.png", &images[1..], [("a.png", false), ("b.png", true)]);
     // Equal numbers need no list.
     fs::write(folder.path().join(LIST), "?").unwrap();
     fs::remove_file(folder.path().join("images/c.png")).unwrap();
