@@ -31,6 +31,7 @@ pub fn run_config() -> RunConfig {
         raygrad: "0.1.0".into(),
         scene: Scene::Embedded,
         downscale: 1,
+        description: None,
         test: None,
         mask_as_alpha: false,
         scene_box: SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]),

@@ -74,7 +74,7 @@ mod tests {
 
     #[test]
     fn bounds_are_in_scene_units() {
-        let mut capture = Scene::Embedded.capture(None).unwrap();
+        let mut capture = Scene::Embedded.capture(None, None).unwrap();
         let mut view = capture.views.remove(0);
         assert_eq!(bounds(&view, 3.0), None);
         view.bounds = Some([2.0, 7.0]);

@@ -24,7 +24,7 @@ use raygrad::nerf::dataset::Capture;
 use super::interrupt::Work;
 use super::output::{complain, print};
 use super::parse;
-use super::scene::Scene;
+use super::scene::{Scene, assumptions};
 use super::{builtin, doctor, interrupt};
 use convert::Target;
 use workplace::Workplace;
@@ -112,7 +112,7 @@ pub fn run(args: &Args) -> Work<()> {
             let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
             let scene = Scene::from(args.input.clone().into_os_string());
             let capture = builtin::capture(&scene, args.size, Some(pictures.path()))?;
-            doctor::assumptions(&capture);
+            assumptions(&capture);
             let to = to.unwrap_or_else(|| Target::of(capture.format));
             convert::convert(capture, to, undistort, args.allow_outside, &args.out)?;
         }

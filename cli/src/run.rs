@@ -52,6 +52,9 @@ pub struct RunConfig {
     pub scene: Scene,
     /// Factor by which the image size was divided. Range: 1 or more.
     pub downscale: usize,
+    /// File that describes the capture, below the scene's folder; null for built-in scenes.
+    #[serde(default)]
+    pub description: Option<PathBuf>,
     /// Test images that the run holds out; null for the choice of the files.
     #[serde(default)]
     pub test: Option<HoldOut>,
@@ -220,13 +223,14 @@ impl Run {
 
     /// Reads the cameras of [`scene`](Self::scene), with the splits of the run.
     pub fn capture(&self, given: Option<&Scene>) -> Result<Capture> {
-        self.scene(given)?.capture(self.config.test.as_ref())
+        self.scene(given)?.capture(self.config.test.as_ref(), self.config.description.as_deref())
     }
 
     /// Opens [`scene`](Self::scene) with the scene transform, the splits and the masks of the run.
     pub fn open_scene(&self, given: Option<&Scene>) -> Result<Opened> {
-        let RunConfig { scene_box, config, test, mask_as_alpha, .. } = &self.config;
-        let mut opened = self.scene(given)?.open_for(scene_box, config.unbounded, test.as_ref())?;
+        let RunConfig { scene_box, config, test, mask_as_alpha, description, .. } = &self.config;
+        let mut opened =
+            self.scene(given)?.open_for(scene_box, config.unbounded, test.as_ref(), description.as_deref())?;
         opened.mask_as_alpha = *mask_as_alpha;
         Ok(opened)
     }
@@ -438,6 +442,7 @@ mod tests {
                 raygrad: "0.1.0".into(),
                 scene: Scene::Embedded,
                 downscale: 2,
+                description: None,
                 test: None,
                 mask_as_alpha: false,
                 scene_box: SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.5, 4.0]),

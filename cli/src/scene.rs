@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use raygrad::nerf::dataset::{
     Capture, Dataset, Format, Frame, HoldOut, LoadOptions, SceneAnalysis, SceneType, Split, evenly_spaced,
@@ -56,8 +56,14 @@ impl fmt::Display for Scene {
 
 impl Scene {
     /// Reads the scene's files and analyses the scene. `asked` overrides the scene type; with `mask_as_alpha` masks cut
-    /// out an object; `hold_out` replaces the splits of the files.
-    pub fn open(&self, asked: Option<SceneType>, mask_as_alpha: bool, hold_out: Option<&HoldOut>) -> Result<Opened> {
+    /// out an object. See [`capture`](Self::capture) for the other arguments.
+    pub fn open(
+        &self,
+        asked: Option<SceneType>,
+        mask_as_alpha: bool,
+        hold_out: Option<&HoldOut>,
+        description: Option<&Path>,
+    ) -> Result<Opened> {
         if !matches!(self, Scene::Folder(_)) {
             if mask_as_alpha {
                 return Err(Error::setting("mask-as-alpha", "built-in scenes have no masks: leave the flag out"));
@@ -67,31 +73,46 @@ impl Scene {
             }
             return Ok(Opened::new(self, None, asked));
         }
-        let capture = self.capture(hold_out)?;
+        let capture = self.capture(hold_out, description)?;
         let analysis = if mask_as_alpha { capture.analyze_cutout(asked) } else { capture.analyze_scene(asked) }?;
         Ok(Opened { mask_as_alpha, ..Opened::new(self, Some((capture, analysis)), asked) })
     }
 
-    /// Reads the capture of a folder, or builds that of a built-in scene without images. `hold_out` replaces the splits.
-    pub fn capture(&self, hold_out: Option<&HoldOut>) -> Result<Capture> {
-        let mut capture = builtin::capture(self, None, None)?;
+    /// Reads the capture of a folder, or builds that of a built-in scene without images, and prints what the reader
+    /// assumed. `hold_out` replaces the splits; `description` is the file to read, below the folder.
+    pub fn capture(&self, hold_out: Option<&HoldOut>, description: Option<&Path>) -> Result<Capture> {
+        let described = match (self, description) {
+            (Scene::Folder(folder), Some(file)) => Some((folder, folder.join(file))).filter(|(_, file)| file.is_file()),
+            _ => None,
+        };
+        let mut capture = match described {
+            Some((folder, file)) => Capture::read_description(folder, file)?,
+            None => builtin::capture(self, None, None)?,
+        };
+        assumptions(&capture);
         hold_out.map_or(Ok(()), |chosen| capture.hold_out(chosen))?;
         Ok(capture)
     }
 
-    /// The same scene, described by a file in this format.
+    /// The file that describes the capture in this format, below the scene's folder.
     ///
     /// # Errors
     /// For a built-in scene, or if the folder has no description in the format.
-    pub fn in_format(&self, format: Format) -> Result<Scene> {
+    pub fn description(&self, format: Format) -> Result<Option<PathBuf>> {
         match self {
-            Scene::Folder(folder) => Ok(Scene::Folder(Capture::read_format(folder, Some(format))?.file)),
+            Scene::Folder(folder) => Ok(inside(&Capture::read_format(folder, Some(format))?)),
             _ => Err(Error::setting("format", "built-in scenes have no files: leave the flag out")),
         }
     }
 
     /// Like [`open`](Self::open), with the scene transform of a model. `unbounded` is true for an unbounded scene.
-    pub fn open_for(&self, extent: &SceneBox, unbounded: bool, hold_out: Option<&HoldOut>) -> Result<Opened> {
+    pub fn open_for(
+        &self,
+        extent: &SceneBox,
+        unbounded: bool,
+        hold_out: Option<&HoldOut>,
+        description: Option<&Path>,
+    ) -> Result<Opened> {
         if !matches!(self, Scene::Folder(_)) {
             return Ok(Opened::new(self, None, None));
         }
@@ -103,7 +124,7 @@ impl Scene {
         };
         let reason = "as in training".to_owned();
         let analysis = SceneAnalysis { transform, scene_type, bounds, near, far, ndc, reason };
-        Ok(Opened::new(self, Some((self.capture(hold_out)?, analysis)), None))
+        Ok(Opened::new(self, Some((self.capture(hold_out, description)?, analysis)), None))
     }
 
     /// The same scene with an absolute path.
@@ -131,6 +152,11 @@ pub struct Opened {
 impl Opened {
     fn new(scene: &Scene, capture: Option<(Capture, SceneAnalysis)>, asked: Option<SceneType>) -> Self {
         Opened { depth: false, mask_as_alpha: false, scene: scene.clone(), capture, asked }
+    }
+
+    /// The file that describes the capture, below its folder.
+    pub fn description(&self) -> Option<PathBuf> {
+        inside(&self.capture.as_ref()?.0)
     }
 
     /// The factor that brings images to a size that trains well; 1 for built-in scenes.
@@ -194,6 +220,16 @@ impl Opened {
     }
 }
 
+/// Prints the assumptions of a capture's reader, one line each.
+pub fn assumptions(capture: &Capture) {
+    capture.assumptions.iter().for_each(|what| complain(&format!("note: {what}")));
+}
+
+/// The file of a capture below its folder.
+fn inside(capture: &Capture) -> Option<PathBuf> {
+    Some(capture.file.strip_prefix(&capture.folder).ok()?.to_owned())
+}
+
 /// Describes skipped images, of which at most three are named. `present` other images exist.
 fn missing(skipped: &[String], present: usize) -> Option<String> {
     /// Names that are listed.
@@ -238,7 +274,7 @@ mod tests {
         std::fs::write(folder.path().join("transforms.json"), transforms.to_string()).unwrap();
         let scene = Scene::Folder(folder.path().to_owned());
         for mask_as_alpha in [false, true] {
-            let opened = scene.open(None, mask_as_alpha, None).unwrap();
+            let opened = scene.open(None, mask_as_alpha, None, None).unwrap();
             let data = opened.load(Split::Train, 1, usize::MAX).unwrap();
             assert_eq!(data.scene_type == SceneType::Bounded, mask_as_alpha);
             let frame = &data.frames[0];
@@ -246,7 +282,7 @@ mod tests {
             let [hidden, used] = [[3, 2], [4, 2]].map(|[x, y]| frame.image.pixel(x, y)[3]);
             assert_eq!((hidden, used), (f32::from(u8::from(!mask_as_alpha)), 1.0));
         }
-        let message = Scene::Embedded.open(None, true, None).err().unwrap().to_string();
+        let message = Scene::Embedded.open(None, true, None, None).err().unwrap().to_string();
         assert_eq!(message, "`mask-as-alpha`: built-in scenes have no masks: leave the flag out");
     }
 }

@@ -267,12 +267,12 @@ pub fn run(args: &Args) -> Work<Trained> {
 /// Trains a new run.
 fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
-    let source = match (&args.scene, args.format) {
-        (scene, Some(format)) => scene.in_format(format)?,
-        (Scene::Folder(input), None) if beside::is_unprepared(input) => Scene::Folder(beside::dataset(input)?),
-        (scene, None) => scene.clone(),
+    let source = match &args.scene {
+        Scene::Folder(input) if beside::is_unprepared(input) => Scene::Folder(beside::dataset(input)?),
+        scene => scene.clone(),
     };
-    let mut scene = source.open(args.scene_type, args.mask_as_alpha, args.test.as_ref())?;
+    let description = args.format.map_or(Ok(None), |format| source.description(format))?;
+    let mut scene = source.open(args.scene_type, args.mask_as_alpha, args.test.as_ref(), description.as_deref())?;
     let downscale = args.downscale.unwrap_or_else(|| scene.automatic_downscale());
     scene.depth = args.has_depth_loss();
     let mut data = scene.load(Split::Train, downscale, usize::MAX)?;
@@ -283,7 +283,7 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     let config = args.config(&data)?;
     let background = config.background.shown();
     let trainer = Trainer::new(config, data.clone())?;
-    let (run, lock) = Run::create(folder, args.run_config(&source, downscale, &trainer, &data)?)?;
+    let (run, lock) = Run::create(folder, args.run_config((&source, &scene), downscale, &trainer, &data)?)?;
     describe(&run, &trainer, &data, &scene)?;
     // Warnings come after all checks, so that an error is the only line of output.
     doctor::warn(&scene);

@@ -86,10 +86,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     })
 }
 
-/// Prints the assumptions of a training scene's reader and warns of problems with its cameras, one line each.
+/// Warns of problems with the cameras of a training scene, one line each.
 pub fn warn(scene: &Opened) {
     let Some((capture, analysis)) = &scene.capture else { return };
-    assumptions(capture);
     let Report { findings, .. } = examine_cameras(capture, Some(analysis));
     // Loading warns of absent images itself.
     let said = |finding: &Finding| finding.kind == FindingKind::ImagesAbsent;
@@ -99,9 +98,4 @@ pub fn warn(scene: &Opened) {
             complain(&format!("{severity}: {kind}: {what}; `raygrad doctor {folder}` shows details"));
         }
     }
-}
-
-/// Prints the assumptions of a capture's reader, one line each.
-pub fn assumptions(capture: &Capture) {
-    capture.assumptions.iter().for_each(|what| complain(&format!("note: {what}")));
 }

@@ -11,7 +11,7 @@ use serde_json::Value;
 
 use super::super::cameras::Viewpoint;
 use super::super::run::{RunConfig, usual_checkpoints};
-use super::super::scene::Scene;
+use super::super::scene::{Opened, Scene};
 use super::Args;
 
 impl Args {
@@ -73,11 +73,18 @@ impl Args {
     }
 
     /// The record of a new run.
-    pub fn run_config(&self, scene: &Scene, downscale: usize, trainer: &Trainer, data: &Dataset) -> Result<RunConfig> {
+    pub fn run_config(
+        &self,
+        (scene, opened): (&Scene, &Opened),
+        downscale: usize,
+        trainer: &Trainer,
+        data: &Dataset,
+    ) -> Result<RunConfig> {
         Ok(RunConfig {
             raygrad: env!("CARGO_PKG_VERSION").to_owned(),
             scene: scene.absolute()?,
             downscale,
+            description: opened.description(),
             test: self.test.clone(),
             mask_as_alpha: self.mask_as_alpha,
             scene_box: trainer.model.scene_box,

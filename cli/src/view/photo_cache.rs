@@ -228,7 +228,7 @@ mod tests {
 
     /// Images of these splits at these positions, looking down.
     fn photos(scene: Scene, places: &[(Split, DVec3)]) -> PhotoCache {
-        let capture = Scene::Landscape.capture(None).unwrap();
+        let capture = Scene::Landscape.capture(None, None).unwrap();
         let mut numbers = [0; 3];
         let entry = |(split, place): &(Split, DVec3)| {
             let which = Split::ALL.iter().position(|own| own == split).unwrap();

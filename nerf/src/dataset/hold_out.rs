@@ -157,7 +157,8 @@ mod tests {
         ] {
             let mut found = held_out(&names, chosen).unwrap();
             let mut expected: Vec<String> = expected.into_iter().map(str::to_owned).collect();
-            (found.sort(), expected.sort());
+            found.sort();
+            expected.sort();
             assert_eq!(found, expected, "{chosen}");
         }
     }

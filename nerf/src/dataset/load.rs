@@ -110,10 +110,22 @@ impl Capture {
         if !path.exists() {
             return Err(Error::file(path, "there is no such folder"));
         }
-        let mut capture = formats::read(path, format)?;
-        capture.split_by_default();
-        capture.check_splits()?;
-        Ok(capture)
+        formats::read(path, format)?.with_default_splits()
+    }
+
+    /// Reads the capture of `folder` by a file that describes it, such as the [`file`](Self::file) of an earlier
+    /// reading.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read), or if the file does not describe a capture.
+    pub fn read_description(folder: impl AsRef<Path>, file: impl AsRef<Path>) -> Result<Capture> {
+        formats::read_file(folder.as_ref(), file.as_ref())?.with_default_splits()
+    }
+
+    fn with_default_splits(mut self) -> Result<Capture> {
+        self.split_by_default();
+        self.check_splits()?;
+        Ok(self)
     }
 
     /// Returns true if a folder or its parent describes a capture, or if the folder is an export of another program that

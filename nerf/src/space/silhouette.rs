@@ -267,7 +267,7 @@ mod tests {
         let views = [view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y), view(DVec3::new(10.0, 0.0, 0.0), DVec3::Y)];
         let mut grid =
             OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &OccupancyConfig::default()).unwrap();
-        let views: Vec<_> = views.iter().map(|frame| of(frame)).collect();
+        let views: Vec<_> = views.iter().map(of).collect();
         carve_views(&mut grid, &views, 1);
         // A third of 5.1 in perspective, with a margin of two pixels and a cell.
         for axis in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]) {
@@ -378,7 +378,7 @@ mod tests {
             });
             let config = OccupancyConfig { resolution: 64, ..OccupancyConfig::default() };
             let mut grid = OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &config).unwrap();
-            let views: Vec<_> = views.iter().map(|frame| of(frame)).collect();
+            let views: Vec<_> = views.iter().map(of).collect();
             carve_views(&mut grid, &views, 1);
             for axis in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]) {
                 assert!(grid.is_occupied(0.8 * axis), "{lens:?}: {axis} is the object's");
@@ -406,7 +406,7 @@ mod tests {
             }
             let config = OccupancyConfig { resolution: 32, ..OccupancyConfig::default() };
             let mut grid = OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &config).unwrap();
-            let views: Vec<_> = views.iter().map(|frame| of(frame)).collect();
+            let views: Vec<_> = views.iter().map(of).collect();
             carve_views(&mut grid, &views, votes);
             grid.occupied_share()
         };

@@ -64,6 +64,15 @@ impl Description {
     }
 }
 
+/// Reads the capture of a folder that a file describes.
+///
+/// # Errors
+/// If the file is not a description, or as the format's own `read`.
+pub(in crate::dataset) fn read_file(folder: &Path, file: &Path) -> Result<Capture> {
+    let description = Description::of_file(file).ok_or_else(|| Error::file(file, "does not describe a capture"))?;
+    Description { folder: folder.to_owned(), ..description }.read()
+}
+
 /// The descriptions in a folder: `transforms.json`, Blender, COLMAP's models, and LLFF. Earlier ones hold more, and are
 /// usually derived from later ones.
 fn descriptions(folder: &Path) -> Vec<Description> {
@@ -152,8 +161,8 @@ fn unknown(folder: &Path, asked: Option<Format>) -> Error {
         let found = if found.is_empty() { "no capture".to_owned() } else { found.join(", ") };
         return Error::file(folder, format!("holds no capture in the format {format}, but {found}"));
     }
-    let whole = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
-    if let Some(parent) = whole.parent().filter(|parent| !descriptions(parent).is_empty()) {
+    let parent = folder.parent().map(|parent| if parent.as_os_str().is_empty() { Path::new(".") } else { parent });
+    if let Some(parent) = parent.filter(|parent| !descriptions(parent).is_empty()) {
         return Error::file(folder, format!("is not a dataset, but `{}` is: use that folder", parent.display()));
     }
     if let Some((_, what, remedy)) = EXPORTS.iter().find(|(name, ..)| folder.join(name).exists()) {

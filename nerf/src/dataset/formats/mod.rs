@@ -25,7 +25,7 @@ mod points;
 pub mod rigid;
 pub mod transforms;
 
-pub(super) use description::{is_described, read};
+pub(super) use description::{is_described, read, read_file};
 pub(super) use locate::factor_of;
 
 #[cfg(test)]
