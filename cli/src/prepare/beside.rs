@@ -2,15 +2,18 @@
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
+use std::time::UNIX_EPOCH;
 
-use raygrad::nerf::Error;
 use raygrad::nerf::dataset::Capture;
+use raygrad::nerf::{Error, Result, write_atomic};
 
 use super::workplace::others;
 use super::{Glass, Input, make, photographs, poses, video};
 use crate::interrupt::{self, Work};
-use crate::output::{complain, entries, print};
+use crate::output::{complain, print};
 
+/// The sources of a dataset, in its folder.
+const SOURCES: &str = "sources.json";
 /// End of the folder's name.
 const ENDING: &str = "-prepared";
 /// Ways to camera poses without COLMAP.
@@ -45,25 +48,39 @@ pub fn dataset(input: &Path) -> Work<PathBuf> {
         print(&format!("prepare  {} has no camera poses: making {} with COLMAP\n", input.display(), out.display()))?;
     }
     interrupt::listen_to_remove();
+    let sources = sources(input)?;
     make(&Input { path: input, frames: super::FRAMES, lens: Glass::default(), allow_outside: false }, &out)?;
+    let text = serde_json::to_string_pretty(&sources).map_err(|e| Error::file(out.join(SOURCES), e))?;
+    write_atomic(out.join(SOURCES), text.as_bytes())?;
     interrupt::listen();
     Ok(out)
 }
 
-/// Fails unless a folder is a dataset of the images of the input. Frames of a video are not compared.
+/// A file of an input: its name, its bytes, and the seconds since 1970 when it was modified.
+type Source = (String, u64, u64);
+
+/// The video, or the images of a folder.
+fn sources(input: &Path) -> Result<Vec<Source>> {
+    let files = if input.is_dir() { photographs::find(input)? } else { vec![input.to_owned()] };
+    let source = |file: PathBuf| {
+        let about = file.metadata().map_err(|e| Error::file(&file, format!("cannot be read: {e}")))?;
+        let modified = about.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+        let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        Ok((name, about.len(), modified.map_or(0, |time| time.as_secs())))
+    };
+    files.into_iter().map(source).collect()
+}
+
+/// Fails unless a folder is a dataset of the images or the video of the input, unchanged.
 fn check_made_from(input: &Path, out: &Path) -> Work<()> {
     let what = format!("was not made from {}: remove or rename it, or train on it", input.display());
     if let Err(error) = Capture::read(out) {
         complain(&error.to_string());
         return Err(Error::file(out, what).into());
     }
-    // Conversion may replace an extension, or add one.
-    let names = |files: Vec<PathBuf>| {
-        let mut names: Vec<OsString> = files.iter().filter_map(|file| photographs::stem(file)).collect();
-        names.sort();
-        names
-    };
-    if input.is_dir() && names(photographs::find(input)?) != names(entries(&out.join("images"))?) {
+    let made = std::fs::read_to_string(out.join(SOURCES)).ok();
+    let made: Option<Vec<Source>> = made.and_then(|text| serde_json::from_str(&text).ok());
+    if made != Some(sources(input)?) {
         return Err(Error::file(out, what).into());
     }
     Ok(())

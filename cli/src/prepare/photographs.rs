@@ -1,7 +1,7 @@
 //! Folders of images without cameras.
 
 use std::collections::HashSet;
-use std::ffi::{OsStr, OsString};
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::dataset::{Photo, copy_upright};
@@ -69,15 +69,6 @@ pub fn ends(path: &Path, endings: &[&str]) -> bool {
     endings.iter().any(|known| known.eq_ignore_ascii_case(ending))
 }
 
-/// The file name without its extensions of images.
-pub fn stem(path: &Path) -> Option<OsString> {
-    let mut name = PathBuf::from(path.file_name()?);
-    while ends(&name, &READ) || ends(&name, &CONVERTED) {
-        name.set_extension("");
-    }
-    Some(name.into_os_string())
-}
-
 /// Refuses a single image as the input.
 pub fn check_no_image(file: &Path) -> Result<()> {
     match [&READ[..], &CONVERTED, &NOT_READ].iter().any(|endings| ends(file, endings)) {
@@ -118,23 +109,4 @@ pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
         }
     }
     Err(Error::file(folder, "holds no images: put .jpg, .png, .webp or .heic files in it or in its folder `images`"))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn stem_is_without_extensions_of_images() {
-        for (name, expected) in [
-            ("a/0.heic", "0"),
-            ("0.heic.jpg", "0"),
-            ("0.JPG", "0"),
-            ("1.5.png", "1.5"),
-            ("jpg", "jpg"),
-            ("a.tif", "a.tif"),
-        ] {
-            assert_eq!(stem(Path::new(name)), Some(expected.into()), "{name}");
-        }
-    }
 }

@@ -573,6 +573,11 @@ fn train_prepares_images_and_videos_once() {
         assert!(said.starts_with(&format!("prepared {input}-prepared, made before from {input}\n")), "{said}");
         assert!(!place.path("log").exists() || !log(&place).contains("mapper"));
     }
+    // Another video of the same name, and changed images.
+    let video = place.bytes("walk.mp4");
+    std::fs::write(place.path("walk.mp4"), [&video[..], b"more"].concat()).unwrap();
+    let refused = "walk.mp4-prepared: was not made from walk.mp4: remove or rename it";
+    complained("changed video", &run(&place, &format!("train walk.mp4 {TRAIN} --steps 1 {CLASSIC}")), &[refused]);
     // Other images than before, and a folder of something else.
     let train = format!("train photos {TRAIN} --steps 1 {CLASSIC}");
     std::fs::write(place.path("photos/new.jpg"), jpeg(4, 1)).unwrap();
@@ -721,14 +726,17 @@ fn heic_images_become_upright_jpegs() {
         }
         // raygrad itself turns this one.
         assert_eq!(Photo::size_of_file(place.path("made/images/7.jpg")).unwrap(), [[8, 16]; 2]);
-        // The converted images are those of the folder.
-        std::fs::rename(place.path("made"), place.path("photos-prepared")).unwrap();
-        let said = String::from_utf8(command(&place, "train photos --steps 1").output().unwrap().stdout).unwrap();
-        assert!(said.starts_with("prepared photos-prepared, made before from photos\n"), "{said}");
-        std::fs::rename(place.path("photos-prepared"), place.path("made")).unwrap();
         let left = std::fs::read_dir(place.path("made")).unwrap().map(|entry| entry.unwrap().file_name());
         assert!(left.into_iter().all(|name| !name.to_str().unwrap().starts_with("heif")));
     }
+}
+
+#[test]
+fn train_reuses_converted_images() {
+    let place = place_with_heic(&["heif-convert"]);
+    let train = format!("train photos {TRAIN} --steps 1 {CLASSIC}");
+    assert!(succeeds(&place, &train).starts_with("prepare  photos has no camera poses"));
+    assert!(succeeds(&place, &train).starts_with("prepared photos-prepared, made before from photos\n"));
 }
 
 #[test]
