@@ -112,9 +112,10 @@ pub fn run(args: &Args) -> Work<()> {
     }
     let model = run.model()?;
     let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
-    let scene = run.scene(args.scene.as_ref())?;
-    let mut capture = builtin::capture(scene, None, args.to.map(|_| pictures.path()))?;
-    run.config.test.as_ref().map_or(Ok(()), |chosen| capture.hold_out(chosen))?;
+    let mut capture = match run.scene(args.scene.as_ref())? {
+        Scene::Folder(_) => run.capture(args.scene.as_ref())?,
+        scene => builtin::capture(scene, None, args.to.map(|_| pictures.path()))?,
+    };
     let refined = refine(&mut capture, &model, &run)?;
     let cameras = capture.views.len();
     match args.to {

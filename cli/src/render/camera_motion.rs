@@ -14,7 +14,7 @@ use crate::cameras::{Viewpoint, fitted};
 use crate::photographs::{Photograph, photographs};
 use crate::run::Run;
 use crate::scene::Scene;
-use crate::{builtin, memory, parse};
+use crate::{memory, parse};
 
 /// Most frames of a video.
 const MOST_FRAMES: usize = 100_000;
@@ -174,9 +174,7 @@ impl CameraPathArgs {
             }
             CameraPath::File(file) => {
                 let path_file::Path { motion, size, fps } =
-                    path_file::read(file, self.path_transform.as_deref(), || {
-                        Ok(builtin::capture(run.scene(scene)?, None, None)?.applied)
-                    })?;
+                    path_file::read(file, self.path_transform.as_deref(), || Ok(run.capture(scene)?.applied))?;
                 let (usual, fps) = (size.unwrap_or(usual), self.fps.or(fps).unwrap_or(FPS));
                 let keys = match motion {
                     Motion::Frames(_) if self.frames.is_some() || self.seconds.is_some() => {
