@@ -302,6 +302,19 @@ fn surface_colors_have_the_exposure_of_renders() {
 }
 
 #[test]
+fn densities_end_at_the_region_and_at_the_model() {
+    // A ball across the upper side of the scene box along x, and one in its middle.
+    let rim = DVec3::new(1.5, 0.0, 0.0);
+    let model = model(&[(rim, RADIUS), (DVec3::ZERO, RADIUS)], Preset::Small);
+    let region = [DVec3::new(0.5, -1.0, -1.0), DVec3::new(3.0, 1.0, 1.0)].into();
+    let probe = Probe::new(&model, Some(region));
+    let points = [[1.4, 0.0, 0.0], [1.6, 0.0, 0.0], [0.0; 3]];
+    let mut found = [9.0; 3];
+    let most = probe.shown(None, None, &points, &mut found);
+    assert!(found[0] > 1e3 && most == found[0] && found[1..] == [0.0; 2], "{found:?} {most}");
+}
+
+#[test]
 fn surface_and_points_of_an_oriented_box() {
     // Along axes that are turned about z, from the ball's centre on. Normals see the cut up to a cell of 0.08 away.
     let rotation = glam::DMat3::from_rotation_z(0.6);
