@@ -5,6 +5,7 @@
 //! `images` in the order of their names, or to those of them that `view_imgs.txt` lists.
 
 use super::limits::{MOST_PIXELS, start};
+use super::locate::stem;
 use super::npy::Matrix;
 use super::{masks, rigid};
 use crate::camera::lens::Lens;
@@ -14,7 +15,6 @@ use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use glam::{DAffine3, DMat3, DVec3};
 use std::collections::BTreeSet;
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 const FILE: &str = "poses_bounds.npy";
@@ -85,11 +85,6 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
 fn list(text: &str) -> Vec<&str> {
     let names = text.trim_start_matches('\u{feff}').lines().map(|line| line.trim().rsplit(['/', '\\']).next());
     names.flatten().filter(|name| !name.is_empty()).collect()
-}
-
-/// A file name in lower case, without its extension.
-fn stem(name: &str) -> Option<OsString> {
-    Path::new(name).file_stem().map(|stem| stem.to_ascii_lowercase())
 }
 
 /// Returns true if `view_imgs.txt` lists an image for each row, and other images than the folder holds.

@@ -111,7 +111,7 @@ fn split(path: &str) -> [&str; 2] {
 }
 
 /// A file name in lower case, without the extension of an image.
-fn stem(name: &str) -> String {
+pub(super) fn stem(name: &str) -> String {
     let ending = extension(name).map_or(0, |ending| ending.len() + 1);
     name[..name.len() - ending].to_lowercase()
 }

@@ -442,6 +442,20 @@ fn plan_counts_the_mask_and_the_depths() {
 }
 
 #[test]
+fn transparent_pixels_of_a_mask_are_black_at_each_size() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("mask.png");
+    // White everywhere, with the shape in alpha.
+    let mut mask = Image { width: 8, height: 8, channels: 4, data: vec![1.0; 8 * 8 * 4] };
+    (0..4).for_each(|y| (0..8).for_each(|x| mask.pixel_mut(x, y)[3] = 0.0));
+    mask.save_png(&path).unwrap();
+    for side in [8, 4, 16] {
+        let mask = used_pixels(&path, [16, 16], [side; 2]).unwrap();
+        assert!(!mask.uses(side / 2, 0) && mask.uses(side / 2, side - 1), "{side}");
+    }
+}
+
+#[test]
 fn automatic_downscale_limits_the_longest_side() {
     let folder = tempfile::tempdir().unwrap();
     let factor = |sizes: &[[usize; 2]], lens: Lens| {

@@ -92,6 +92,9 @@ fn ambiguous_files_are_refused() {
         found(&["a/0.png", "a/1.png", "b/1.png", "b/0.png"], &["x/2.png", "y/0.png", "y/1.png"]).unwrap_err().0,
         1
     );
+    // A folder without a common part must hold most names.
+    finds(&["a/0.png", "b/1.png"], &["x/0.png", "x/1.png"], &["", ""]);
+    finds(&["x/a/0.png", "x/b/1.png"], &["y/a/0.png", "y/a/2.png"], &["x/a/0.png", ""]);
     // The same name twice is no ambiguity.
     assert!(found(&["images/0.png"], &["x/0.png", "x/0.png"]).is_ok());
 }
