@@ -338,7 +338,7 @@ mod tests {
             Frame { name: String::new(), camera, image: image.into(), mask: None, distances: None }
         };
         let mut rectified = None;
-        let frames = [Lens::Pinhole, lenses()[1], lenses()[3], lenses()[1]].map(frame);
+        let frames = [Lens::Pinhole, lenses()[1], lenses()[1], lenses()[3]].map(frame);
         let all = frames.each_ref().map(|frame| Silhouette::new(frame, &mut rectified).unwrap());
         assert!(rectified.is_some_and(|map| map.is_of(&frames[3].camera) && !map.is_of(&frames[2].camera)));
         let (mut same, mut clear) = (0, 0);

@@ -375,6 +375,7 @@ fn single_invalid_cameras_are_left_out() {
         ("3 PINHOLE 8 6 nan 9 4 3", "", "fx: must be a finite number, is NaN"),
         ("3 PINHOLE 0 6 9 9 4 3", "", "width: must be 1 to"),
         ("3 EUCM 8 6 9 9 4 3 1 1", "", "EUCM is not supported"),
+        ("3 EQUIRECTANGULAR 8 6 8 7", "", "must be those of the image, 8 and 6, are 8 and 7"),
         ("", "3 0 0 0 0 0 0 4 3 3.png\n", "qvec: is a quaternion of length 0"),
         ("", "3 1 0 0 0 inf 0 4 3 3.png\n", "tvec: must be a finite number, is inf"),
     ] {

@@ -392,3 +392,16 @@ fn half_of_the_frames_must_have_a_pose_and_lists_may_name_the_others() {
     assert_eq!(with(5, 2).unwrap().views.len(), 3);
     says(&failure(with(4, 2), FILE), &["`frames[0].transform_matrix`", "row 0, column 3 is not a finite number"]);
 }
+
+#[test]
+fn masks_take_no_place_of_images() {
+    let folder = folder(|d| {
+        for (i, frame) in d["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
+            frame["file_path"] = json!(format!("photos/{i}.jpg"));
+            frame["mask_path"] = json!(format!("images/{i}.png"));
+        }
+    });
+    let views = read(folder.path()).unwrap().views;
+    assert!(views.iter().all(|view| view.image.is_none()));
+    assert_eq!(views[0].mask, Some(folder.path().join("images/0.png")));
+}
