@@ -220,6 +220,14 @@ fn masks_as_alpha_stay_in_all_commands() {
     let (ignored, cut) = (psnr("ignored", ""), psnr("cut", "--mask-as-alpha"));
     assert_eq!((ignored.0, cut.0), (Value::Null, json!(true)));
     assert!(ignored.1 != cut.1);
+    // The same model, evaluated where masks are ignored.
+    let config = place.json("cut/config.json");
+    let other = config.to_string().replace("\"mask_as_alpha\":true", "\"mask_as_alpha\":false");
+    std::fs::write(place.path("cut/config.json"), other).unwrap();
+    place.succeeds("eval cut");
+    assert!(place.json("cut/eval-test-fast.json")["psnr_mean"].as_f64().unwrap() != cut.1);
+    std::fs::write(place.path("cut/config.json"), config.to_string()).unwrap();
+    place.succeeds("eval cut");
     let output = place.command("compare ignored cut").output().unwrap();
     let all = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap()).concat();
     assert!(all.contains("mask_as_alpha"), "{all}");
