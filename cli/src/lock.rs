@@ -8,6 +8,9 @@ use raygrad::nerf::{Error, Result, write_atomic};
 
 use super::output::{complain, remove};
 
+/// Lock file of a program that writes all results of a folder.
+pub const UNFINISHED: &str = "unfinished.lock";
+
 /// Exclusive access to a folder, until this is dropped or the program ends.
 ///
 /// The lock is on a file. If the folder is moved and another one is created at its path, the lock moves with it. So a
