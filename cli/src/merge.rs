@@ -6,10 +6,11 @@ use raygrad::nerf::Error;
 
 use super::interrupt::Work;
 use super::output::print;
+use super::prepare::convert;
 use super::shard::{self, Complete, Progress, Shard};
 use super::{eval, render};
 
-/// Merge the shards of a render or an evaluation
+/// Merge shards of `render`, `eval` or `prepare`
 ///
 /// The last shard to finish merges all of them, so this is needed only if that one was killed, or if the last ones
 /// finished at the same moment on different machines.
@@ -17,19 +18,20 @@ use super::{eval, render};
 /// Example: raygrad merge orbit.mp4
 #[derive(clap::Args)]
 pub struct Args {
-    /// The video or folder of --out, or RUN/eval-SPLIT-SKIP
+    /// The --out of the shards, or RUN/eval-SPLIT-SKIP
     out: PathBuf,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Work<()> {
     let out = &args.out;
-    let places = [out.clone(), render::frames_of(out)];
+    let mut places = vec![out.clone(), render::frames_of(out)];
+    places.extend(convert::staging(out));
     let at = places.iter().find(|place| place.join(shard::FOLDER).is_dir()).unwrap_or(out);
     let what = match shard::progress(at)? {
         Progress::Complete(complete) => return merge(*complete),
         Progress::None => {
-            "holds no shards: name the --out of `raygrad render --shard`, or the folder of `raygrad eval --shard`"
+            "holds no shards: name the --out of `render` or `prepare`, or the folder RUN/eval-SPLIT-SKIP of `eval`"
                 .into()
         }
         Progress::Merging => "another raygrad merges the shards: wait until it ends".into(),
@@ -54,6 +56,7 @@ pub fn merge_if_complete(at: &Path, shard: Shard) -> Work<()> {
 fn merge(complete: Complete) -> Work<()> {
     match complete.whole.command.as_str() {
         render::COMMAND => render::merge(complete),
+        convert::COMMAND => convert::merge(complete),
         eval::COMMAND => Ok(eval::merge(complete)?),
         other => {
             let what = format!(

@@ -80,7 +80,7 @@ pub struct Whole {
 
 /// The contents of a record.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-struct Record {
+pub struct Record {
     #[serde(flatten)]
     whole: Whole,
     /// Number of shards.
@@ -129,6 +129,7 @@ impl Part {
             if is_new {
                 remove(&[part.folder.join(shard.file("json"))]);
             }
+            part.lock.remove();
             return Err(error);
         }
         Ok(part)
@@ -155,9 +156,9 @@ impl Part {
         self.save()
     }
 
-    /// Counts one more complete item.
-    pub fn advance(&mut self) -> Result<()> {
-        self.record.done += 1;
+    /// Counts more complete items.
+    pub fn advance(&mut self, count: usize) -> Result<()> {
+        self.record.done += count;
         self.save()
     }
 
@@ -241,7 +242,7 @@ fn records(at: &Path) -> Result<BTreeMap<usize, Record>> {
 }
 
 /// Reads a record; `None` if another program has just removed it.
-fn read(path: &Path, number: usize) -> Result<Option<Record>> {
+pub fn read(path: &Path, number: usize) -> Result<Option<Record>> {
     let text = match read_text(path, "a record of a shard") {
         Err(_) if path.symlink_metadata().is_err_and(|e| e.kind() == ErrorKind::NotFound) => return Ok(None),
         text => text?,
@@ -407,5 +408,146 @@ pub fn clear(at: &Path) {
         .and_then(|scratch| std::fs::rename(&folder, scratch.path().join(FOLDER)));
     if let Err(e) = cleared {
         complain(&format!("warning: {}: cannot be removed: {e}", folder.display()));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn open(at: &Path, shard: &str, inputs: Value) -> Result<Part> {
+        let whole = Whole { command: "render".to_owned(), inputs, items: 7 };
+        Part::open(at, shard.parse().unwrap(), whole, Value::Null)
+    }
+
+    /// Completes a shard.
+    fn complete(at: &Path, shard: &str) {
+        let mut part = open(at, shard, json!({})).unwrap();
+        part.advance(part.items().len() - part.done()).unwrap();
+        part.finish();
+    }
+
+    #[test]
+    fn shard_parses_or_refuses() {
+        for text in ["1/1", "2/5", "10000/10000"] {
+            assert_eq!(text.parse::<Shard>().unwrap().to_string(), text);
+        }
+        for bad in ["", "/", "1", "0/1", "2/1", "1/0", "1/10001", "-1/2", "1/2/3", "1.0/2", "99999999999999999999/2"] {
+            assert_eq!(
+                bad.parse::<Shard>(),
+                Err("write I/N such as 1/5, with I from 1 to N and N at most 10000".into())
+            );
+        }
+    }
+
+    #[test]
+    fn items_are_interleaved_and_shared_out_once() {
+        let of = |shard: &str, total: usize| shard.parse::<Shard>().unwrap().items(total).collect::<Vec<_>>();
+        assert_eq!([of("1/3", 7), of("2/3", 7), of("3/3", 7)], [vec![0, 3, 6], vec![1, 4], vec![2, 5]]);
+        for (count, total) in (1..9).flat_map(|count| (0..20).map(move |total| (count, total))) {
+            let shares: Vec<_> = (1..=count).map(|i| of(&format!("{i}/{count}"), total)).collect();
+            let sizes = shares.iter().map(Vec::len);
+            assert!(sizes.clone().max().unwrap() - sizes.min().unwrap() <= 1);
+            let mut all = shares.concat();
+            all.sort_unstable();
+            assert!(all.into_iter().eq(0..total), "{count} {total}");
+        }
+    }
+
+    #[test]
+    fn part_keeps_complete_items() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = folder.path();
+        let mut part = open(at, "2/3", json!({})).unwrap();
+        assert_eq!((part.done(), part.next()), (0, Some(1)));
+        part.advance(1).unwrap();
+        assert_eq!(part.next(), Some(4));
+        part.advance(1).unwrap();
+        assert_eq!(part.next(), None);
+        drop(part);
+        let mut part = open(at, "2/3", json!({})).unwrap();
+        part.retain(|item| item != 4).unwrap();
+        drop(part);
+        assert_eq!(open(at, "2/3", json!({})).unwrap().next(), Some(4));
+        // A share may be empty.
+        std::fs::remove_dir_all(at.join(FOLDER)).unwrap();
+        let part = open(at, "8/8", json!({})).unwrap();
+        assert_eq!((part.done(), part.next()), (0, None));
+        // The folder was removed, and another program has begun.
+        let part = open(at, "1/8", json!({})).unwrap();
+        std::fs::remove_dir_all(at.join(FOLDER)).unwrap();
+        let error = part.write(&at.join("0.png"), b"frame").unwrap_err().to_string();
+        assert!(error.contains("was removed or moved"), "{error}");
+        let other = open(at, "1/8", json!({})).unwrap();
+        let error = part.write(&at.join("0.png"), b"frame").unwrap_err().to_string();
+        assert!(error.contains("another raygrad now works on this shard") && !at.join("0.png").exists(), "{error}");
+        part.finish();
+        assert_eq!(other.lock.state(), State::Kept);
+    }
+
+    #[test]
+    fn parts_of_different_jobs_never_both_open() {
+        for _ in 0..20 {
+            let folder = tempfile::tempdir().unwrap();
+            let (barrier, at) = (std::sync::Barrier::new(2), folder.path());
+            let begin = |shard: &str, size: u32| {
+                barrier.wait();
+                open(at, shard, json!({ "size": size })).is_ok()
+            };
+            let both = std::thread::scope(|scope| {
+                let other = scope.spawn(|| begin("2/2", 8));
+                [begin("1/2", 7), other.join().unwrap()]
+            });
+            assert_ne!(both, [true; 2]);
+        }
+    }
+
+    #[test]
+    fn check_names_differences_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = folder.path();
+        let of = |size: u32| json!({ "of": { "size": size, "path": "a".repeat(size as usize) }, "size": size });
+        open(at, "1/2", of(100)).unwrap();
+        let error = open(at, "2/2", of(3)).err().unwrap().to_string();
+        let expected = format!(
+            "{}: holds shards of another job: `path` is \"{}... there, \"aaa\" here, `size` is 100 there, 3 here; use the \
+             same arguments, or remove {} to start again",
+            at.display(),
+            "a".repeat(59),
+            at.join(FOLDER).display()
+        );
+        assert_eq!(error, expected);
+        assert_eq!(records(at).unwrap().len(), 1);
+    }
+
+    #[test]
+    fn progress_names_missing_shards_until_all_are_complete() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = folder.path();
+        let words = || match progress(at).unwrap() {
+            Progress::None => "none".to_owned(),
+            Progress::Complete(complete) => {
+                clear(at);
+                complete.lock.remove();
+                "complete".to_owned()
+            }
+            Progress::Merging => "merging".to_owned(),
+            Progress::Incomplete(words) => words,
+        };
+        assert_eq!(words(), "none");
+        complete(at, "3/3");
+        let part = open(at, "2/3", json!({})).unwrap();
+        assert_eq!(words(), "1/3 (not begun), 2/3 (running, 0 of 2)");
+        drop(part);
+        assert_eq!(words(), "1/3 (not begun), 2/3 (stopped, 0 of 2)");
+        complete(at, "1/3");
+        complete(at, "2/3");
+        let merging = Lock::take(&at.join(UNFINISHED), || Error::file(at, "is busy")).unwrap();
+        assert_eq!(words(), "merging");
+        merging.remove();
+        assert_eq!(words(), "complete");
+        assert_eq!((words(), std::fs::read_dir(at).unwrap().count()), ("none".to_owned(), 0));
+        complete(at, "7/9");
+        assert_eq!(words(), "1/9 (not begun), 2/9 (not begun), 3/9 (not begun), 4/9 (not begun) and 4 more");
     }
 }

@@ -347,7 +347,7 @@ fn measure_shard(mut judge: Judge, shard: Shard, inputs: &Inputs, machine: &Mach
             }
         }
         show_progress(&progress, [part.done() + 1, items.len()], &view);
-        part.advance()?;
+        part.advance(1)?;
     }
     part.finish();
     Ok(())

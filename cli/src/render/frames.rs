@@ -187,7 +187,7 @@ impl Frames {
         self.put(&path, &png_with_text(picture, self.job.mark()))?;
         match &mut self.claim {
             Claim::All(record, _) => record.done += 1,
-            Claim::Shard(part) => return part.advance(),
+            Claim::Shard(part) => return part.advance(1),
         }
         self.write()
     }

@@ -146,10 +146,7 @@ fn shard_of_another_job_is_refused() {
         "render run --frames 5 --size 8x6 --out out --shard 2/2",
         &["`frames` is 4 there, 5 here", "`cameras` is "],
     );
-    refused(
-        "render run --frames 4 --size 8x6 --fps 9 --seconds 4 --out out --shard 2/2",
-        &["`seconds` is null there, 4.0 here"],
-    );
+    refused("render run --seconds 4 --fps 1 --size 8x6 --out out --shard 2/2", &["`seconds` is null there, 4.0 here"]);
     refused(&format!("{render} --save depth --shard 2/2"), &["`save` is [] there, [\"depth\"] here"]);
     refused(&format!("{render} --shard 2/3"), &["`shards` is 2 there, 3 here"]);
     // Its own record too.
@@ -256,6 +253,40 @@ fn merge_makes_the_result_of_complete_shards() {
     std::fs::write(place.path("other.gif.frames/0009.png"), b"photograph").unwrap();
     at_once(&place, &format!("{render} other.gif"), 2);
     assert_eq!(place.bytes("other.gif.frames/0009.png"), b"photograph");
+}
+
+#[test]
+fn prepare_in_shards_equals_the_whole() {
+    let place = Place::with_scene();
+    for flags in ["--to nerfstudio", "--undistort", "--to llff"] {
+        let convert = format!("prepare scene {flags} --out");
+        place.succeeds(&format!("{convert} whole"));
+        for count in [1, 2, 5] {
+            let out = format!("made-{count}");
+            for i in 1..=count {
+                assert!(!place.path(&out).exists());
+                place.succeeds(&format!("{convert} {out} --shard {i}/{count}"));
+            }
+            assert!(files(&place, &out) == files(&place, "whole"), "{flags} in {count}");
+            std::fs::remove_dir_all(place.path(&out)).unwrap();
+        }
+        std::fs::remove_dir_all(place.path("whole")).unwrap();
+    }
+    let convert = "prepare scene --to colmap --out made";
+    at_once(&place, convert, 3);
+    place.fails_with(&format!("{convert} --shard 1/2"), "made: exists: choose another --out, or leave out --shard");
+    std::fs::remove_dir_all(place.path("made")).unwrap();
+    place.succeeds(&format!("{convert} --shard 1/2"));
+    place.fails("prepare scene --to llff --out made --shard 2/2", &["`to` is \"colmap\" there, \"llff\" here"]);
+    place.fails("merge made", &["made: misses shards 2/2 (not begun)"]);
+    place.fails_with("prepare scene --out new --shard 1/2", "`shard`: needs a conversion: add --to or --undistort");
+    std::fs::remove_dir_all(place.path(".made-unfinished-shards")).unwrap();
+    unmerged(&place, convert, ".made-unfinished-shards");
+    std::fs::write(place.path(".made-unfinished-shards/dataset/images/.raygrad-tmp-abc"), b"half").unwrap();
+    place.succeeds("merge made");
+    assert!(!place.path("made/images/.raygrad-tmp-abc").exists() && place.path("made/images").is_dir());
+    let names = place.path("").read_dir().unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    assert_eq!(names.filter(|name| name.starts_with('.')).count(), 0);
 }
 
 /// A place with a run and 24 test images of one colour each, so that ranks of PSNR and places differ.
