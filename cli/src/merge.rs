@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use raygrad::nerf::Error;
 
-use super::interrupt::Work;
+use super::interrupt::{self, Work};
 use super::output::print;
 use super::prepare::convert;
 use super::shard::{self, Complete, Progress, Shard};
@@ -24,6 +24,7 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Work<()> {
+    interrupt::listen_to_go_on();
     let out = &args.out;
     let mut places = vec![out.clone(), render::frames_of(out)];
     places.extend(convert::staging(out));

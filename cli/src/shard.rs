@@ -167,7 +167,7 @@ impl Part {
         self.check_lock()?;
         let staged = self.folder.join(self.shard.file("part"));
         std::fs::write(&staged, bytes).map_err(|e| Error::file(path, format!("cannot be written: {e}")))?;
-        Ok(rename_durable(staged, path)?)
+        rename_durable(staged, path)
     }
 
     /// Releases the shard. Another program may have merged it already.
@@ -365,8 +365,11 @@ fn incomplete(at: &Path, all: &BTreeMap<usize, Record>, count: usize) -> Option<
         let shard = Shard { number, count };
         let Some(record) = all.get(&number) else { return Some(format!("{shard} (not begun)")) };
         let share = shard.items(record.whole.items).len();
-        let state = if Lock::is_taken(&at.join(FOLDER).join(shard.file("lock"))) { "running" } else { "stopped" };
-        (record.done < share).then(|| format!("{shard} ({state}, {} of {share})", record.done))
+        (record.done < share).then(|| {
+            let is_running = Lock::is_taken(&at.join(FOLDER).join(shard.file("lock")));
+            let state = if is_running { "running" } else { "stopped" };
+            format!("{shard} ({state}, {} of {share})", record.done)
+        })
     });
     let missing: Vec<String> = missing.collect();
     let more = missing.len().saturating_sub(NAMED);
