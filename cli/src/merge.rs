@@ -12,8 +12,8 @@ use super::{eval, render};
 
 /// Merge shards of `render`, `eval` or `prepare`
 ///
-/// The last shard to finish merges all of them, so this is needed only if that one was killed, or if the last ones
-/// finished at the same moment on different machines.
+/// The last shard to finish merges all of them. Use this command if that shard was killed, or if two shards finished at
+/// the same moment on different machines.
 ///
 /// Example: raygrad merge orbit.mp4
 #[derive(clap::Args)]

@@ -237,7 +237,7 @@ struct Inputs {
     images: String,
 }
 
-/// A checksum of names, sizes and cameras of images.
+/// A checksum of names and cameras of images.
 fn fingerprint(data: &Dataset) -> Result<String> {
     let all: Vec<_> = data.frames.iter().map(|frame| (&frame.name, &frame.camera)).collect();
     let bytes = serde_json::to_vec(&all).map_err(|e| Error::setting("scene", e))?;
@@ -321,7 +321,6 @@ fn describe(report: &Report, folder: &Path) -> Result<()> {
 
 /// Measures the views of a shard. Each has a file beside the shards' records, and so has each image of the page.
 fn measure_shard(mut judge: Judge, shard: Shard, inputs: &Inputs, machine: &Machine, folder: &Path) -> Result<()> {
-    make_folder(folder)?;
     let count = judge.data.frames.len();
     let whole = Whole { command: COMMAND.to_owned(), inputs: json!(inputs), items: count };
     let (mut part, regular) = (Part::open(folder, shard, whole, json!(machine))?, report::regular(count));
