@@ -78,7 +78,9 @@ impl Lock {
 
     /// Returns true if another program has locked the file.
     pub fn is_taken(path: &Path) -> bool {
-        File::open(path).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
+        // Network file systems lock files only that are open for writing.
+        let file = File::options().write(true).open(path).or_else(|_| File::open(path));
+        file.is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
     }
 
     /// The state of the lock.

@@ -28,8 +28,10 @@ pub fn run(args: &Args) -> Work<()> {
     let out = &args.out;
     let mut places = vec![out.clone(), render::frames_of(out)];
     places.extend(convert::staging(out));
-    let at = places.iter().find(|place| place.join(shard::FOLDER).is_dir()).unwrap_or(out);
-    let what = match shard::progress(at)? {
+    let at = places.into_iter().find(|place| place.join(shard::FOLDER).is_dir()).unwrap_or_else(|| out.clone());
+    // The result is beside it, and `.` has no name.
+    let at = if at.file_name().is_none() { at.canonicalize().unwrap_or(at) } else { at };
+    let what = match shard::progress(&at)? {
         Progress::Complete(complete) => return merge(*complete),
         Progress::None => {
             "holds no shards: name the --out of `render` or `prepare`, or the folder RUN/eval-SPLIT-SKIP of `eval`"

@@ -291,9 +291,9 @@ fn new_unfinished(folder: &Path) -> Result<PathBuf> {
 
 /// The file of the result whose images are in a folder.
 fn result_of(folder: &Path) -> PathBuf {
-    let mut name = folder.as_os_str().to_owned();
+    let mut name = folder.file_name().unwrap_or_default().to_owned();
     name.push(".json");
-    name.into()
+    folder.with_file_name(name)
 }
 
 /// Replaces the result and its page, after the evaluation is complete. The images are in [`new_unfinished`].

@@ -349,7 +349,11 @@ fn eval_in_shards_equals_the_whole() {
     assert!(done == 12 || said(&output).contains(&format!("resuming after {done} of 12 images of shard 1/2")));
     std::fs::remove_dir_all(place.path(&format!("run/eval-test/{FOLDER}"))).unwrap();
     unmerged(&place, "--threads 2 eval run", "run/eval-test");
-    place.succeeds("merge run/eval-test");
+    place.succeeds("merge run/eval-test/");
+    assert!(result(&place) == whole);
+    remove();
+    unmerged(&place, "--threads 2 eval run", "run/eval-test");
+    said(&place.command("merge .").current_dir(place.path("run/eval-test")).output().unwrap());
     assert!(result(&place) == whole);
     place.fails("merge run/eval-test", &["run/eval-test: holds no shards"]);
     // Shards of several machines.
