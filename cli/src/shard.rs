@@ -476,6 +476,15 @@ mod tests {
         std::fs::remove_dir_all(at.join(FOLDER)).unwrap();
         let part = open(at, "8/8", json!({})).unwrap();
         assert_eq!((part.done(), part.next()), (0, None));
+        // A file is replaced when the new one is complete.
+        std::fs::write(at.join("0.png"), b"good").unwrap();
+        std::fs::create_dir(at.join(FOLDER).join("shard-8.part")).unwrap();
+        assert!(part.write(&at.join("0.png"), b"new").is_err());
+        assert_eq!(std::fs::read(at.join("0.png")).unwrap(), b"good");
+        std::fs::remove_dir(at.join(FOLDER).join("shard-8.part")).unwrap();
+        part.write(&at.join("0.png"), b"new").unwrap();
+        assert_eq!(std::fs::read(at.join("0.png")).unwrap(), b"new");
+        std::fs::remove_file(at.join("0.png")).unwrap();
         // The folder was removed, and another program has begun.
         let part = open(at, "1/8", json!({})).unwrap();
         std::fs::remove_dir_all(at.join(FOLDER)).unwrap();
