@@ -364,7 +364,8 @@ fn image_of(folder: &Path, i: usize) -> PathBuf {
 
 fn read_view(path: &Path) -> Result<Compared> {
     let text = parse::read_text(path, "a measured view")?;
-    serde_json::from_str(&text).map_err(|e| Error::file(path, format!("is not a measured view: {e}")))
+    let bad = |e| Error::file(path, format!("is not a measured view ({e}): remove it and run its shard again"));
+    serde_json::from_str(&text).map_err(bad)
 }
 
 /// Writes the result of complete shards.
