@@ -18,7 +18,7 @@ use super::interrupt::{self, Work};
 use super::output::{parent, print};
 use super::overwrite::Job;
 use super::photographs::{check_trained, present};
-use super::prepare::convert::{Target, convert, relative};
+use super::prepare::convert::{Conversion, Target, relative};
 use super::run::{Run, check_output};
 use super::scene::Scene;
 use super::scratch::ScratchFolder;
@@ -122,7 +122,7 @@ pub fn run(args: &Args) -> Work<()> {
         None => write(capture, &args.out, &job)?,
         Some(target) => {
             interrupt::listen_to_remove();
-            convert(capture, target, false, args.allow_outside, &args.out)?;
+            Conversion { capture, target, undistort: false, allow_outside: args.allow_outside }.run(&args.out)?;
         }
     }
     print(&format!("exported {cameras} cameras, {refined} of them refined: {}\n", args.out.display()))?;

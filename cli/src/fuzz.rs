@@ -10,6 +10,7 @@ use super::render::frames;
 use super::render::path_file::{self, Motion};
 use super::run::{Run, RunConfig};
 use super::scene::Scene;
+use super::shard;
 use super::train::changed;
 use super::view::messages::{ClientMessage, Eye, View};
 use proptest::prelude::*;
@@ -241,6 +242,19 @@ fn names_of_nested_values_take_linear_memory() {
     let (result, taken) = peak(|| parse(bytes.as_bytes()));
     result.unwrap();
     assert!(taken < 64 * bytes.len(), "{taken} bytes of memory for {}", bytes.len());
+}
+
+#[test]
+fn campaign_records_of_shards() {
+    let inputs = json!({ "arguments": { "run": "/runs/a", "size": [64, 48] }, "of": { "model": "0a1b2c3d" } });
+    let record = json!({
+        "command": "render", "inputs": inputs, "items": 20, "shards": 3, "done": 5, "own": { "strange": true },
+    });
+    let parse = from_file("shard-2.json", |file| shard::read(file, 2).map(drop));
+    let bound = Bound { times: 64, plus: 1 << 16 };
+    campaign("record of a shard", &[record.to_string().into_bytes()], bound, parse, |error| {
+        clear(error, "shard-2.json")
+    });
 }
 
 #[test]

@@ -8,6 +8,9 @@ use raygrad::nerf::{Error, Result, write_atomic};
 
 use super::output::{complain, remove};
 
+/// Lock file of a program that writes all results of a folder.
+pub const UNFINISHED: &str = "unfinished.lock";
+
 /// Exclusive access to a folder, until this is dropped or the program ends.
 ///
 /// The lock is on a file. If the folder is moved and another one is created at its path, the lock moves with it. So a
@@ -75,7 +78,9 @@ impl Lock {
 
     /// Returns true if another program has locked the file.
     pub fn is_taken(path: &Path) -> bool {
-        File::open(path).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
+        // Network file systems lock files only that are open for writing.
+        let file = File::options().write(true).open(path).or_else(|_| File::open(path));
+        file.is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
     }
 
     /// The state of the lock.

@@ -20,6 +20,7 @@ mod lock;
 mod machine;
 mod man;
 mod memory;
+mod merge;
 mod output;
 mod overwrite;
 mod parse;
@@ -34,6 +35,7 @@ mod render;
 mod run;
 mod scene;
 mod scratch;
+mod shard;
 mod summary;
 mod train;
 mod view;
@@ -82,6 +84,7 @@ enum Command {
     Eval(eval::Args),
     Compare(compare::Args),
     Render(render::Args),
+    Merge(merge::Args),
     View(view::Args),
     Doctor(doctor::Args),
     Export(export::Args),
@@ -125,6 +128,7 @@ fn run(cli: Cli) -> Work<ExitCode> {
         Some(Command::Completions(args)) => completions::run(&args)?,
         Some(Command::Man(args)) => man::run(&args)?,
         Some(Command::Render(args)) => render::run(&args)?,
+        Some(Command::Merge(args)) => merge::run(&args)?,
         Some(Command::View(args)) => view::run(&args)?,
     }
     Ok(ExitCode::SUCCESS)

@@ -9,10 +9,11 @@ use std::path::Path;
 
 use crc::{CRC_64_XZ, Crc};
 use raygrad::nerf::{Error, Result};
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 /// The arguments of a command, except for the output path.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Job {
     mark: String,
     /// True if everything may be replaced.

@@ -2,10 +2,10 @@
 
 use clap::ValueEnum;
 use raygrad::nerf::{Camera, Image, Model, Render, Result};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Arithmetic of a render.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
     /// Single precision

@@ -25,8 +25,9 @@ use super::interrupt::Work;
 use super::output::{complain, print};
 use super::parse;
 use super::scene::{Scene, assumptions};
+use super::shard::Shard;
 use super::{builtin, doctor, interrupt};
-use convert::Target;
+use convert::{Conversion, Target};
 use workplace::Workplace;
 
 /// Frames to take from a video by default.
@@ -76,6 +77,12 @@ pub struct Args {
     /// By default a new dataset takes no file from outside the input folder, not even through a link.
     #[arg(long, help_heading = "Output")]
     allow_outside: bool,
+    /// Convert every Nth image, starting with the Ith
+    ///
+    /// For several programs, such as a job array, that convert one dataset to a new folder. Give each the same command
+    /// with another I of I/N. The last one to finish makes the folder. See `raygrad merge`.
+    #[arg(long, help_heading = "Output", value_name = "I/N")]
+    shard: Option<Shard>,
     /// Image width of a built-in scene, in pixels
     ///
     /// The default is 200 for embedded and 400 for landscape.
@@ -105,7 +112,14 @@ impl Glass {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Work<()> {
-    interrupt::listen_to_remove();
+    if args.shard.is_some() {
+        if args.to.is_none() && !args.undistort {
+            return Err(Error::setting("shard", "needs a conversion: add --to or --undistort").into());
+        }
+        interrupt::listen_to_go_on();
+    } else {
+        interrupt::listen_to_remove();
+    }
     match (args.to, args.undistort) {
         (None, false) => prepare(args)?,
         (to, undistort) => {
@@ -114,12 +128,19 @@ pub fn run(args: &Args) -> Work<()> {
             let capture = builtin::capture(&scene, args.size, Some(pictures.path()))?;
             assumptions(&capture);
             let to = to.unwrap_or_else(|| Target::of(capture.format));
-            convert::convert(capture, to, undistort, args.allow_outside, &args.out)?;
+            let conversion = Conversion { capture, target: to, undistort, allow_outside: args.allow_outside };
+            if let Some(shard) = args.shard {
+                return conversion.run_shard(&args.out, shard);
+            }
+            conversion.run(&args.out)?;
         }
     }
-    let out = args.out.display();
-    print(&format!("next     raygrad doctor {out}   to check it\n         raygrad train {out}   to train on it\n"))?;
-    Ok(())
+    Ok(next(args.out.display())?)
+}
+
+/// Prints the next commands for a dataset.
+fn next(out: std::path::Display<'_>) -> raygrad::nerf::Result<()> {
+    print(&format!("next     raygrad doctor {out}   to check it\n         raygrad train {out}   to train on it\n"))
 }
 
 /// A video or images without cameras.

@@ -12,9 +12,11 @@ use std::time::Instant;
 
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Camera, Error, Result, write_atomic};
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::interrupt::{self, Stop, Work};
+use super::merge;
 use super::output::{check_writable, checksum, note, other_numbered, parent, print};
 use super::overwrite::{Job, png_with_text};
 use super::parse;
@@ -22,11 +24,12 @@ use super::precision::{Precision, Renderer};
 use super::progress::{Progress, spoken};
 use super::run::{Run, check_output};
 use super::scene::Scene;
+use super::shard::{Complete, Shard, Whole};
 use camera_motion::{CameraMotion, CameraPath, CameraPathArgs};
 use frames::{DIGITS, Frames};
 use shown::{Layer, Show, Shown};
 pub use video::frames_of;
-use video::{VideoFormat, VideoWriter};
+use video::{VideoFormat, VideoWriter, video_of};
 
 /// Render images or a video
 ///
@@ -89,6 +92,12 @@ pub struct Args {
     /// reference for measurements.
     #[arg(long, help_heading = "Advanced", hide_possible_values = true, value_enum, default_value_t)]
     precision: Precision,
+    /// Render every Nth frame, starting with the Ith
+    ///
+    /// For several programs, such as a job array, that write to one folder. Give each the same command with another
+    /// I of I/N. The last one to finish makes the video. See `raygrad merge`.
+    #[arg(long, help_heading = "Output", value_name = "I/N")]
+    shard: Option<Shard>,
     /// Keep a video's frames in FILE.frames/
     #[arg(long, help_heading = "Output")]
     keep_frames: bool,
@@ -118,6 +127,7 @@ impl Args {
             background: None,
             skip: None,
             precision: Precision::F32,
+            shard: None,
             keep_frames: false,
             overwrite: false,
             scene: None,
@@ -131,6 +141,9 @@ impl Args {
         let unfit = |flag: &str, what: &str| Err(Error::setting(flag, what));
         if kind != Kind::Folder && !self.save.is_empty() {
             return unfit("save", "needs a folder: name one with --out");
+        }
+        if kind == Kind::Png && self.shard.is_some() {
+            return unfit("shard", "needs several frames: name a folder or a video with --out");
         }
         if !self.save.contains(&Layer::Depth) && self.depth_unit.is_some() {
             return unfit("depth-unit", "needs --save depth");
@@ -146,10 +159,10 @@ impl Args {
         Ok(kind)
     }
 
-    /// The job of the output: all arguments that affect it, except for the model.
-    fn job(&self, run: &Run) -> Job {
+    /// All arguments that affect the output, except for the model.
+    fn arguments(&self, run: &Run) -> Value {
         let Args { flight, show, save, depth_unit, background, skip, precision, .. } = self;
-        let arguments = json!({
+        json!({
             "run": run.identity(),
             "flight": flight,
             "show": show,
@@ -158,9 +171,7 @@ impl Args {
             "background": background,
             "skip": skip.map(|skip| skip.to_string()),
             "precision": precision,
-        });
-        // Without --out, renders go to a folder of the run, which no one else writes to.
-        Job::new("render", &arguments, self.overwrite || self.out.is_none())
+        })
     }
 }
 
@@ -169,7 +180,9 @@ pub fn run(args: &Args) -> Work<()> {
     let run = Run::open(&args.run)?;
     let out = args.out.clone().unwrap_or_else(|| run.file(args.flight.path.name()));
     let kind = args.kind(&out)?;
-    let job = args.job(&run);
+    let arguments = args.arguments(&run);
+    // Without --out, renders go to a folder of the run, which no one else writes to.
+    let job = Job::new(COMMAND, &arguments, args.overwrite || args.out.is_none());
     check_output(&out)?;
     if kind != Kind::Folder {
         job.check(&out)?;
@@ -181,7 +194,7 @@ pub fn run(args: &Args) -> Work<()> {
     if let Some(skip) = args.skip {
         model.set_skip(skip);
     }
-    let CameraMotion { mut cameras, fps } = args.flight.cameras(&run, &model, args.scene.as_ref())?;
+    let CameraMotion { cameras, fps } = args.flight.cameras(&run, &model, args.scene.as_ref())?;
     let extent = model.scene_box;
     let background = args.background.unwrap_or(model.config.background.shown());
     let show = args.show;
@@ -194,8 +207,7 @@ pub fn run(args: &Args) -> Work<()> {
             let picture = shown.frame(&cameras[0]).image.to_png();
             job.check(&out)?;
             write_atomic(&out, &png_with_text(&picture, job.mark()))?;
-            cameras.truncate(1);
-            return Ok(report(&cameras, &out)?);
+            return Ok(report(1, [cameras[0].width, cameras[0].height], &out)?);
         }
         Kind::Video(video) => {
             video.check(&out, fps, [cameras[0].width, cameras[0].height])?;
@@ -204,35 +216,94 @@ pub fn run(args: &Args) -> Work<()> {
         Kind::Folder => out.clone(),
     };
     let of = contents(args, stored, &cameras, &shown)?;
-    let mut frames = Frames::new(folder, of, &job, cameras.len(), &args.save)?;
+    let size = [cameras[0].width, cameras[0].height];
+    let output = Output { kind, frames: cameras.len(), size, fps, keep_frames: args.keep_frames };
+    let mut frames = match args.shard {
+        None => Frames::new(folder, of, &job, cameras.len(), &args.save)?,
+        Some(shard) => {
+            let inputs = json!(Inputs { arguments, of, output: output.clone() });
+            let whole = Whole { command: COMMAND.to_owned(), inputs, items: cameras.len() };
+            Frames::of_shard(folder, shard, whole, &job, &args.save)?
+        }
+    };
     if cameras.len() > 1 {
         interrupt::listen_to_go_on();
     }
     if args.ends_with_input {
         interrupt::listen_to_input();
     }
-    let done = render(&shown, &cameras, &mut frames).and_then(|()| {
-        let Kind::Video(video) = kind else { return Ok(()) };
-        let size = [cameras[0].width, cameras[0].height];
-        video.write(&VideoWriter { folder: frames.folder(), count: cameras.len(), size, fps, job: &job }, &out)
-    });
-    if let Err(Stop::Interrupted) = done {
-        let (done, all, folder) = (frames.done(), cameras.len(), frames.folder().display());
-        print(&format!("stopped  after {done} of {all} frames, in {folder}: run the same command to resume\n"))?;
+    let rendered = render(&shown, &cameras, &mut frames);
+    if let Err(Stop::Interrupted) = rendered {
+        frames.stopped(AGAIN)?;
     }
-    done?;
-    match kind {
-        Kind::Video(_) if !args.keep_frames => frames.remove(),
-        _ => {
-            frames.keep();
-            let older = other_numbered(&out, DIGITS, &(0..cameras.len()).collect::<Vec<_>>());
-            if !older.is_empty() {
-                // They may be files that users want to keep.
-                note(&format!("{} also holds {} numbered images of a longer path", out.display(), older.len()));
+    rendered?;
+    let Some(shard) = args.shard else { return output.complete(frames, &job, &out, AGAIN) };
+    let folder = frames.folder().to_owned();
+    frames.keep();
+    merge::merge_if_complete(&folder, shard)
+}
+
+/// The name of the command in marks and records.
+pub const COMMAND: &str = "render";
+/// How to resume after an interruption.
+const AGAIN: &str = "run the same command";
+
+/// All inputs of the frames of shards.
+#[derive(Serialize, Deserialize)]
+struct Inputs {
+    arguments: Value,
+    of: Value,
+    output: Output,
+}
+
+/// Merges the frames of complete shards.
+pub fn merge(complete: Complete) -> Work<()> {
+    let Inputs { of, output, .. } = complete.inputs()?;
+    let folder = complete.at().to_owned();
+    let out = match output.kind {
+        Kind::Video(_) => video_of(&folder)?,
+        _ => folder.clone(),
+    };
+    let (frames, job) = Frames::of_shards(complete, of)?;
+    let again = format!("run `raygrad merge {}`", folder.display());
+    output.complete(frames, &job, &out, &again)
+}
+
+/// What is made of the frames.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Output {
+    kind: Kind,
+    frames: usize,
+    size: [usize; 2],
+    fps: f64,
+    keep_frames: bool,
+}
+
+impl Output {
+    /// Makes the video and removes its frames, or keeps them. `again` is how to resume after an interruption.
+    fn complete(&self, frames: Frames, job: &Job, out: &Path, again: &str) -> Work<()> {
+        let &Output { kind, frames: count, size, fps, keep_frames } = self;
+        if let Kind::Video(video) = kind {
+            let written = video.write(&VideoWriter { folder: frames.folder(), count, size, fps, job }, out);
+            if let Err(Stop::Interrupted) = written {
+                frames.stopped(again)?;
+            }
+            written?;
+        }
+        frames.drop_shards()?;
+        match kind {
+            Kind::Video(_) if !keep_frames => frames.remove(),
+            _ => {
+                frames.keep();
+                let older = other_numbered(out, DIGITS, &(0..count).collect::<Vec<_>>());
+                if !older.is_empty() {
+                    // They may be files that users want to keep.
+                    note(&format!("{} also holds {} numbered images of a longer path", out.display(), older.len()));
+                }
             }
         }
+        Ok(report(count, size, out)?)
     }
-    Ok(report(&cameras, &out)?)
 }
 
 /// The default video extension: MP4, which plays everywhere, or else GIF, which needs no other program.
@@ -248,18 +319,18 @@ const MILLI: f64 = 1e-3;
 
 /// Renders the missing frames.
 fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Work<()> {
-    let (start, first, all) = (Instant::now(), frames.done(), cameras.len());
+    let (start, first, all) = (Instant::now(), frames.done(), frames.count());
     if first > 0 {
         note(&format!("resuming after {first} of {all} frames: {}", frames.folder().display()));
     }
     let progress = Progress::new();
     let mut beyond = 0;
-    for camera in &cameras[first..] {
+    while let Some(number) = frames.next() {
         if interrupt::requested() {
             return Err(Stop::Interrupted);
         }
-        let frame = shown.frame(camera);
-        frames.push(&frame.image.to_png(), &frame.layers)?;
+        let frame = shown.frame(&cameras[number]);
+        frames.push(number, &frame.image.to_png(), &frame.layers)?;
         beyond += usize::from(frame.beyond > 0);
         let done = frames.done();
         progress.set(done as f64 / all as f64, || {
@@ -285,10 +356,9 @@ fn time_left(seconds: f64, [first, done, all]: [usize; 3]) -> f64 {
     seconds * (all - done) as f64 / (done - first) as f64
 }
 
-fn report(cameras: &[Camera], out: &Path) -> Result<()> {
-    let [width, height] = [cameras[0].width, cameras[0].height];
-    let frames = if cameras.len() == 1 { "frame" } else { "frames" };
-    print(&format!("rendered {} {frames} of {width}x{height}: {}\n", cameras.len(), out.display()))
+fn report(count: usize, [width, height]: [usize; 2], out: &Path) -> Result<()> {
+    let frames = if count == 1 { "frame" } else { "frames" };
+    print(&format!("rendered {count} {frames} of {width}x{height}: {}\n", out.display()))
 }
 
 /// All inputs of the frames, including the checksums of model and configuration.
@@ -311,7 +381,7 @@ fn contents(args: &Args, [model, config]: [String; 2], cameras: &[Camera], shown
 }
 
 /// Kind of the output.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum Kind {
     /// A folder of PNG files.
     Folder,

@@ -2,10 +2,10 @@
 
 use raygrad::nerf::dataset::{Dataset, Split};
 use raygrad::nerf::{Error, InstantConfig, Model, Result};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Cameras of the evaluated views.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Alignment {
     /// The cameras of the scene; the model has no pose refinement.
     #[serde(rename = "none")]
@@ -57,7 +57,7 @@ impl Alignment {
 }
 
 /// Appearance of the evaluated views, as that of held-out images is unknown.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Appearance {
     /// The model has no appearance parameters.
     #[serde(rename = "none")]

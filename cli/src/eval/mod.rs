@@ -4,7 +4,6 @@ pub mod alignment;
 mod page;
 mod report;
 
-use std::collections::BTreeSet;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -15,27 +14,33 @@ use raygrad::nerf::imaging::lpips::{Backbone, Lpips};
 use raygrad::nerf::imaging::metrics::{SSIM_WINDOW, psnr_from_mse, ssim, weighted_mse};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
 use raygrad::nerf::{
-    Background, Error, Evaluations, Image, Render, Result, available_memory, fitted_cameras, rename_durable,
-    write_atomic,
+    Background, Error, Image, Render, Result, available_memory, fitted_cameras, rename_durable, write_atomic,
 };
+use serde::{Deserialize, Serialize};
+use serde_json::json;
 
-use super::lock::{Lock, State};
+use super::interrupt::Work;
+use super::lock::{Lock, State, UNFINISHED as UNFINISHED_LOCK};
 use super::machine::processor;
+use super::merge;
 use super::output::{checksum, complain, depth_colors, make_folder, note, numbered, other_numbered, print, remove};
 use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
 use super::run::{Run, write_json};
 use super::scene::{Opened, Scene};
+use super::shard::{self, Complete, Part, Shard, Whole};
 use alignment::{Alignment, Appearance};
-use report::{Identity, Perceived, Report, Score, table};
+use report::{Compared, Conditions, Identity, Machine, Report, Score, Weights, table};
 
 /// Digits of the number of an image file.
 const DIGITS: usize = 3;
 /// Folder of the image files until the evaluation is complete.
 const UNFINISHED: &str = "unfinished";
-/// Lock file of an evaluation.
-const LOCK: &str = "unfinished.lock";
+/// The page of a result.
+const PAGE: &str = "index.html";
+/// The name of the command in records.
+pub const COMMAND: &str = "eval";
 
 /// Measure PSNR, SSIM and LPIPS on held-out images
 ///
@@ -91,6 +96,12 @@ pub struct Args {
     /// reference for measurements.
     #[arg(long, help_heading = "Advanced", hide_possible_values = true, value_enum, default_value_t)]
     precision: Precision,
+    /// Measure every Nth view, starting with the Ith
+    ///
+    /// For several programs, such as a job array, that evaluate one run. Give each the same command with another I of
+    /// I/N. The last one to finish writes the result. See `raygrad merge`.
+    #[arg(long, help_heading = "Output", value_name = "I/N", conflicts_with = "json")]
+    shard: Option<Shard>,
     /// Print the result as JSON
     #[arg(long, help_heading = "Output")]
     json: bool,
@@ -130,11 +141,12 @@ fn hold_out(run: &Run, opened: &Opened) -> &'static str {
 }
 
 /// Evaluates the model, writes the files and prints the result.
-pub fn run(args: &Args) -> Result<()> {
+pub fn run(args: &Args) -> Work<()> {
     let run = Run::open(&args.run)?;
     // The checksum is computed before the model is read. If the file is replaced meanwhile, the result does not name
     // the new model.
     let crc32 = checksum(&run.model_file())?;
+    let config = checksum(&run.file("config.json"))?;
     let mut model = run.model()?;
     let identity = Identity::of(&run, &model, crc32);
     let lpips = args.lpips.as_ref().map(Lpips::open).transpose()?;
@@ -152,8 +164,9 @@ pub fn run(args: &Args) -> Result<()> {
             "the {} image `{}` was a training image of the run: name the unchanged capture with --scene",
             args.split, frame.name
         );
-        return Err(Error::setting("scene", what));
+        return Err(Error::setting("scene", what).into());
     }
+    let images = fingerprint(&data)?;
     let appearance = Appearance::of(&model, args.split, args.fit_half);
     if let Some(lpips) = &lpips {
         check_seen(lpips.backbone(), &data, appearance)?;
@@ -169,32 +182,18 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let skip = model.marching().map(|marching| marching.config.occupancy.skip);
     let name = args.name(skip, lpips.as_ref().map(Lpips::backbone));
-    let pictures = run.file(&name);
-    make_folder(&pictures)?;
-    let busy = || Error::file(&pictures, "another raygrad is writing it: wait until it ends");
-    let lock = Lock::take(&pictures.join(LOCK), busy)?;
-    // Files of an interrupted evaluation are discarded.
-    let unfinished = pictures.join(UNFINISHED);
-    let _ = std::fs::remove_dir_all(&unfinished);
-    make_folder(&unfinished)?;
     let own = |frame: &Frame| {
         let number = run.config.images.iter().position(|name| *name == frame.name);
         number.filter(|_| appearance == Appearance::Own).map(|number| number as u32)
     };
     let looks = data.frames.iter().map(own).collect();
-    let (background, span) = (shown_background(model.config.background), model.scene_box.near_far);
-    let renderer = Renderer::new(model, args.precision)?;
-    let mut judge = Judge { renderer, background: background.shown(), span, data, looks, appearance, lpips };
-    let (per_view, seconds_per_view, evaluations) = judge.all(&unfinished)?;
-    let data = &judge.data;
-    let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
-    let per_pixel = |count: u64| count as f64 / pixels as f64;
-    let report = Report {
-        raygrad: env!("CARGO_PKG_VERSION"),
+    let background = shown_background(model.config.background);
+    let conditions = Conditions {
+        raygrad: env!("CARGO_PKG_VERSION").to_owned(),
         scene: scene.absolute()?,
         split: args.split,
-        hold_out: hold_out(&run, &opened),
-        views: per_view.len(),
+        hold_out: hold_out(&run, &opened).to_owned(),
+        views: data.frames.len(),
         width: data.frames[0].image.width,
         height: data.frames[0].image.height,
         downscale: run.config.downscale,
@@ -205,46 +204,198 @@ pub fn run(args: &Args) -> Result<()> {
         cameras,
         appearance,
         pixel_offset: 0.5,
-        quantisation: "none",
+        quantisation: "none".to_owned(),
         model: identity,
-        threads: rayon::current_num_threads(),
-        processor: processor(),
-        psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),
-        ssim_mean: mean(per_view.iter().map(|score| score.ssim)),
-        lpips: judge.lpips.as_ref().zip(weights).map(|(lpips, crc32)| Perceived {
-            lpips_mean: mean(per_view.iter().map(|score| score.lpips)),
-            lpips_backbone: lpips.backbone(),
-            lpips_crc32: crc32,
-        }),
-        seconds_per_view,
-        density_per_pixel: per_pixel(evaluations.density),
-        color_per_pixel: per_pixel(evaluations.color),
-        unskipped_per_pixel: per_pixel(evaluations.unskipped),
-        per_view,
     };
-    let file = run.file(&format!("{name}.json"));
-    let drawn = report.drawn();
-    judge.draw_others(&drawn, &unfinished)?;
+    let weights = lpips.as_ref().zip(weights);
+    let weights = weights.map(|(lpips, lpips_crc32)| Weights { lpips_backbone: lpips.backbone(), lpips_crc32 });
+    let machine = Machine { threads: rayon::current_num_threads(), processor: processor() };
+    let span = model.scene_box.near_far;
+    let renderer = Renderer::new(model, args.precision)?;
+    let judge = Judge { renderer, background: background.shown(), span, data, looks, appearance, lpips };
+    let folder = run.file(&name);
+    let Some(shard) = args.shard else {
+        let report = all(judge, |views| Report::new(conditions, weights, vec![machine], views), &folder)?;
+        if !args.json {
+            return Ok(describe(&report, &folder)?);
+        }
+        let text = serde_json::to_string_pretty(&report).map_err(|e| Error::file(result_of(&folder), e))?;
+        return Ok(print(&format!("{text}\n"))?);
+    };
+    let inputs = Inputs { conditions, weights, config, images };
+    measure_shard(judge, shard, &inputs, &machine, &folder)?;
+    merge::merge_if_complete(&folder, shard)
+}
+
+/// All inputs of an evaluation in shards.
+#[derive(Serialize, Deserialize)]
+struct Inputs {
+    conditions: Conditions,
+    weights: Option<Weights>,
+    /// Checksums of `config.json` and of names and cameras of the images.
+    config: String,
+    images: String,
+}
+
+/// A checksum of names and cameras of images.
+fn fingerprint(data: &Dataset) -> Result<String> {
+    let all: Vec<_> = data.frames.iter().map(|frame| (&frame.name, &frame.camera)).collect();
+    let bytes = serde_json::to_vec(&all).map_err(|e| Error::setting("scene", e))?;
+    Ok(format!("{:08x}", crc32fast::hash(&bytes)))
+}
+
+/// Measures all views and writes the result.
+fn all(mut judge: Judge, report: impl FnOnce(Vec<Compared>) -> Report, folder: &Path) -> Result<Report> {
+    let lock = lock(folder)?;
+    let unfinished = new_unfinished(folder)?;
+    let count = judge.data.frames.len();
+    let regular = report::regular(count);
+    let progress = Progress::new();
+    let mut views = Vec::with_capacity(count);
+    for i in 0..count {
+        let (view, shown) = judge.compare(i)?;
+        if regular.contains(&i) {
+            judge.draw(&shown).save_png(unfinished.join(numbered(i, DIGITS)))?;
+        }
+        show_progress(&progress, [i + 1, count], &view);
+        views.push(view);
+    }
+    drop(progress);
+    let report = report(views);
+    for &i in report.drawn().difference(&regular) {
+        judge.drawn(i)?.save_png(unfinished.join(numbered(i, DIGITS)))?;
+    }
+    finish(&report, folder, &lock)?;
+    lock.remove();
+    Ok(report)
+}
+
+/// Locks the folder of a result against other evaluations of all its views.
+fn lock(folder: &Path) -> Result<Lock> {
+    shard::check_none(folder)?;
+    make_folder(folder)?;
+    let busy = || Error::file(folder, "another raygrad is writing it: wait until it ends");
+    let lock = Lock::take(&folder.join(UNFINISHED_LOCK), busy)?;
+    // A shard may have begun meanwhile.
+    shard::check_none(folder)?;
+    Ok(lock)
+}
+
+/// Creates the folder of unfinished images, and discards those of an interrupted evaluation.
+fn new_unfinished(folder: &Path) -> Result<PathBuf> {
+    let unfinished = folder.join(UNFINISHED);
+    let _ = std::fs::remove_dir_all(&unfinished);
+    make_folder(&unfinished)?;
+    Ok(unfinished)
+}
+
+/// The file of the result whose images are in a folder.
+fn result_of(folder: &Path) -> PathBuf {
+    let mut name = folder.file_name().unwrap_or_default().to_owned();
+    name.push(".json");
+    folder.with_file_name(name)
+}
+
+/// Replaces the result and its page, after the evaluation is complete. The images are in [`new_unfinished`].
+fn finish(report: &Report, folder: &Path, lock: &Lock) -> Result<()> {
     if lock.state() != State::Kept {
         let what = "was removed, or another raygrad evaluates there now: nothing was written; run the command again";
-        return Err(Error::file(&pictures, what));
+        return Err(Error::file(folder, what));
     }
-    // The result is replaced only after the evaluation is complete.
-    write_json(&file, &report)?;
+    write_json(&result_of(folder), report)?;
+    let (drawn, unfinished) = (report.drawn(), folder.join(UNFINISHED));
     for name in drawn.iter().map(|&i| numbered(i, DIGITS)) {
-        rename_durable(unfinished.join(&name), pictures.join(&name))?;
+        rename_durable(unfinished.join(&name), folder.join(&name))?;
     }
     let _ = std::fs::remove_dir(&unfinished);
-    lock.remove();
     // Renders of earlier evaluations with other views would belong to no result.
-    remove(&other_numbered(&pictures, DIGITS, &drawn.iter().copied().collect::<Vec<_>>()));
-    let index = pictures.join("index.html");
-    write_atomic(&index, page::page(&report).as_bytes())?;
-    if args.json {
-        let text = serde_json::to_string_pretty(&report).map_err(|e| Error::file(&file, e))?;
-        return print(&format!("{text}\n"));
+    remove(&other_numbered(folder, DIGITS, &drawn.iter().copied().collect::<Vec<_>>()));
+    write_atomic(folder.join(PAGE), page::page(report).as_bytes())
+}
+
+/// Prints a report and where it is.
+fn describe(report: &Report, folder: &Path) -> Result<()> {
+    let [file, index] = [result_of(folder), folder.join(PAGE)];
+    print(&format!("{}written: {}, {}\n", table(report), file.display(), index.display()))
+}
+
+/// Measures the views of a shard. Each has a file beside the shards' records, and so has each image of the page.
+fn measure_shard(mut judge: Judge, shard: Shard, inputs: &Inputs, machine: &Machine, folder: &Path) -> Result<()> {
+    let count = judge.data.frames.len();
+    let whole = Whole { command: COMMAND.to_owned(), inputs: json!(inputs), items: count };
+    let (mut part, regular) = (Part::open(folder, shard, whole, json!(machine))?, report::regular(count));
+    let items: Vec<usize> = part.items().collect();
+    part.retain(|i| view_of(folder, i).is_file() && (!regular.contains(&i) || image_of(folder, i).is_file()))?;
+    if part.done() > 0 && part.next().is_some() {
+        note(&format!("resuming after {} of {} images of shard {shard}", part.done(), items.len()));
     }
-    print(&format!("{}written: {}, {}\n", table(&report), file.display(), index.display()))
+    let progress = Progress::new();
+    while let Some(i) = part.next() {
+        let (view, shown) = judge.compare(i)?;
+        let write = |i: usize, image: Image| part.write(&image_of(folder, i), &image.to_png());
+        if regular.contains(&i) {
+            write(i, judge.draw(&shown))?;
+        }
+        part.write(&view_of(folder, i), json!(view).to_string().as_bytes())?;
+        if part.done() + 1 == items.len() {
+            // The worst of all views are among the worst of each shard.
+            let psnr =
+                items.iter().map(|&i| Ok(read_view(&view_of(folder, i))?.score.psnr)).collect::<Result<Vec<f64>>>()?;
+            for i in report::worst(&psnr).into_iter().map(|k| items[k]).filter(|i| !regular.contains(i)) {
+                write(i, judge.drawn(i)?)?;
+            }
+        }
+        show_progress(&progress, [part.done() + 1, items.len()], &view);
+        part.advance(1)?;
+    }
+    part.finish();
+    Ok(())
+}
+
+/// The file of a view that a shard has measured.
+fn view_of(folder: &Path, i: usize) -> PathBuf {
+    folder.join(shard::FOLDER).join(format!("view-{i}.json"))
+}
+
+/// The image of a view that a shard has drawn.
+fn image_of(folder: &Path, i: usize) -> PathBuf {
+    folder.join(shard::FOLDER).join(numbered(i, DIGITS))
+}
+
+fn read_view(path: &Path) -> Result<Compared> {
+    let text = parse::read_text(path, "a measured view")?;
+    let bad = |e| Error::file(path, format!("is not a measured view ({e}): remove it and run its shard again"));
+    serde_json::from_str(&text).map_err(bad)
+}
+
+/// Writes the result of complete shards.
+pub fn merge(complete: Complete) -> Result<()> {
+    let folder = complete.at().to_owned();
+    let Inputs { conditions, weights, .. } = complete.inputs()?;
+    let view = |i: usize| {
+        let file = view_of(&folder, i);
+        complete.check(i, &file)?;
+        read_view(&file)
+    };
+    let views = (0..complete.whole.items).map(view).collect::<Result<Vec<_>>>()?;
+    let report = Report::new(conditions, weights, complete.own()?, views);
+    let unfinished = new_unfinished(&folder)?;
+    for i in report.drawn() {
+        let from = image_of(&folder, i);
+        complete.check(i, &from)?;
+        // They stay among the records, so that an interrupted merge can be repeated.
+        std::fs::copy(&from, unfinished.join(numbered(i, DIGITS)))
+            .map_err(|e| Error::file(&from, format!("cannot be copied: {e}")))?;
+    }
+    finish(&report, &folder, &complete.lock)?;
+    shard::clear(&folder);
+    complete.lock.remove();
+    describe(&report, &folder)
+}
+
+fn show_progress(progress: &Progress, [done, count]: [usize; 2], view: &Compared) {
+    let Score { name, psnr, .. } = &view.score;
+    progress.set(done as f64 / count as f64, || format!("image {done} of {count}  {name}  PSNR {psnr:.2}"));
 }
 
 /// Checks that unmasked images are large enough for the network, and that there is one. Notes masked images, and warns
@@ -286,13 +437,6 @@ fn shown_background(trained: Background) -> Background {
     }
 }
 
-/// The mean; `None` if there are no values or one is missing.
-fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
-    let count = values.len();
-    let sum: Option<f64> = values.sum();
-    sum.filter(|_| count > 0).map(|sum| sum / count as f64)
-}
-
 /// Renders views and compares them with images.
 struct Judge {
     renderer: Renderer,
@@ -307,39 +451,23 @@ struct Judge {
 }
 
 impl Judge {
-    /// Renders and scores all views. Draws some of them. Returns scores, mean seconds per view, and total evaluations.
-    fn all(&mut self, pictures: &Path) -> Result<(Vec<Score>, f64, Evaluations)> {
-        let count = self.data.frames.len();
-        let drawn = report::regular(count);
-        let (mut scores, mut seconds, mut evaluations) = (Vec::with_capacity(count), 0.0, Evaluations::default());
-        let progress = Progress::new();
-        for i in 0..count {
-            let start = Instant::now();
-            let picture = self.render(i);
-            seconds += start.elapsed().as_secs_f64();
-            evaluations = evaluations + picture.evaluations;
-            let shown = self.shown(i, picture)?;
-            let Shown { picture, truth, half } = &shown;
-            let score = score(&self.data.frames[i], &picture.color, truth, *half, self.lpips.as_ref());
-            if drawn.contains(&i) {
-                self.draw(&shown).save_png(pictures.join(numbered(i, DIGITS)))?;
-            }
-            let done = i + 1;
-            progress.set(done as f64 / count as f64, || {
-                format!("image {done} of {count}  {}  PSNR {:.2}", score.name, score.psnr)
-            });
-            scores.push(score);
-        }
-        Ok((scores, seconds / count as f64, evaluations))
+    /// Renders and scores a view.
+    fn compare(&mut self, i: usize) -> Result<(Compared, Shown)> {
+        let start = Instant::now();
+        let picture = self.render(i);
+        let (seconds, evaluations) = (start.elapsed().as_secs_f64(), picture.evaluations);
+        let shown = self.shown(i, picture)?;
+        let Shown { picture, truth, half } = &shown;
+        let frame = &self.data.frames[i];
+        let score = score(frame, &picture.color, truth, *half, self.lpips.as_ref());
+        let pixels = frame.image.width * frame.image.height;
+        Ok((Compared { score, seconds, evaluations, pixels }, shown))
     }
 
-    /// Draws the views that [`all`](Self::all) has not drawn.
-    fn draw_others(&mut self, views: &BTreeSet<usize>, pictures: &Path) -> Result<()> {
-        for &i in views.difference(&report::regular(self.data.frames.len())) {
-            let picture = self.render(i);
-            self.draw(&self.shown(i, picture)?).save_png(pictures.join(numbered(i, DIGITS)))?;
-        }
-        Ok(())
+    /// Renders and draws a view.
+    fn drawn(&mut self, i: usize) -> Result<Image> {
+        let picture = self.render(i);
+        Ok(self.draw(&self.shown(i, picture)?))
     }
 
     fn render(&mut self, i: usize) -> Render {

@@ -28,7 +28,7 @@ pub fn page(report: &Report) -> String {
         format!("<tr><td>{}</td><td>{psnr:.2}</td><td>{}</td>{lpips}</tr>\n", escaped(name), four_digits(*ssim))
     };
     let views = order.iter().map(|&i| row(&report.per_view[i]));
-    let title = format!("{}, {} split: {:.2} dB", report.scene, report.split, report.psnr_mean);
+    let title = format!("{}, {} split: {:.2} dB", report.conditions.scene, report.conditions.split, report.psnr_mean);
     let lpips = report.lpips.as_ref().map_or("", |_| "<th>LPIPS</th>").to_owned();
     let places = [("title", escaped(&title)), ("facts", facts(report)), ("lpips", lpips)];
     filled(

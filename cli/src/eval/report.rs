@@ -6,8 +6,8 @@ use std::fmt;
 use raygrad::nerf::dataset::{Split, evenly_spaced};
 use raygrad::nerf::imaging::lpips::Backbone;
 use raygrad::nerf::space::occupancy::Skipping;
-use raygrad::nerf::{Background, Budget, Model, StepStats};
-use serde::{Serialize, Serializer};
+use raygrad::nerf::{Background, Budget, Evaluations, Model, StepStats};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::alignment::{Alignment, Appearance};
 use crate::precision::Precision;
@@ -19,22 +19,22 @@ const PICTURES: usize = 10;
 /// Number of worst views that are drawn.
 const WORST: usize = 3;
 
-/// The result: `eval-SPLIT-SKIP.json`, with measured values and all conditions.
-#[derive(Serialize)]
-pub struct Report {
+/// The conditions of an evaluation, known before the first render. They are equal for all its shards.
+#[derive(Serialize, Deserialize)]
+pub struct Conditions {
     /// Version of raygrad for the evaluation.
-    pub raygrad: &'static str,
+    pub raygrad: String,
     pub scene: Scene,
     pub split: Split,
     /// The rule that selects the held-out images.
-    pub hold_out: &'static str,
+    pub hold_out: String,
     /// Number of views.
     pub views: usize,
     pub width: usize,
     pub height: usize,
     pub downscale: usize,
     /// True if masks are the alpha of the images.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub mask_as_alpha: bool,
     /// Background of transparent images.
     pub background: Background,
@@ -49,10 +49,27 @@ pub struct Report {
     /// Position of the ray in a pixel: 0.5 is the centre.
     pub pixel_offset: f64,
     /// `none`: floating-point renders, clamped to 0..=1, are compared.
-    pub quantisation: &'static str,
+    pub quantisation: String,
     pub model: Identity,
+}
+
+/// The machine of an evaluation.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct Machine {
     pub threads: usize,
     pub processor: String,
+}
+
+/// The result: `eval-SPLIT-SKIP.json`, with measured values and all conditions.
+#[derive(Serialize)]
+pub struct Report {
+    #[serde(flatten)]
+    pub conditions: Conditions,
+    /// Shards may be from several machines.
+    #[serde(serialize_with = "one_or_list")]
+    pub threads: BTreeSet<usize>,
+    #[serde(serialize_with = "one_or_list")]
+    pub processor: BTreeSet<String>,
     /// Mean PSNR in dB; `inf` and `NaN` as strings.
     #[serde(serialize_with = "number")]
     pub psnr_mean: f64,
@@ -70,20 +87,45 @@ pub struct Report {
     pub per_view: Vec<Score>,
 }
 
-/// LPIPS and its conditions, if enabled.
-#[derive(Serialize)]
-pub struct Perceived {
-    /// Mean LPIPS; null if an image is masked.
-    #[serde(serialize_with = "some")]
-    pub lpips_mean: Option<f64>,
+/// Serialises the only element, or else a list.
+fn one_or_list<T: Serialize + Ord, S: Serializer>(all: &BTreeSet<T>, serializer: S) -> Result<S::Ok, S::Error> {
+    match all.first().filter(|_| all.len() == 1) {
+        Some(one) => one.serialize(serializer),
+        None => all.serialize(serializer),
+    }
+}
+
+/// The network of LPIPS.
+#[derive(Serialize, Deserialize)]
+pub struct Weights {
     /// Network of the features.
     pub lpips_backbone: Backbone,
     /// CRC-32 of the weights file.
     pub lpips_crc32: String,
 }
 
-/// Identifies the model and its training.
+/// One compared view.
+#[derive(Serialize, Deserialize)]
+pub struct Compared {
+    pub score: Score,
+    /// Seconds to render it.
+    pub seconds: f64,
+    pub evaluations: Evaluations,
+    pub pixels: usize,
+}
+
+/// LPIPS and its conditions, if enabled.
 #[derive(Serialize)]
+pub struct Perceived {
+    /// Mean LPIPS; null if an image is masked.
+    #[serde(serialize_with = "some")]
+    pub lpips_mean: Option<f64>,
+    #[serde(flatten)]
+    pub weights: Weights,
+}
+
+/// Identifies the model and its training.
+#[derive(Serialize, Deserialize)]
 pub struct Identity {
     /// CRC-32 of the model file.
     pub crc32: String,
@@ -130,36 +172,76 @@ pub fn regular(views: usize) -> BTreeSet<usize> {
 }
 
 impl Report {
+    /// The report of all views.
+    pub fn new(conditions: Conditions, weights: Option<Weights>, machines: Vec<Machine>, views: Vec<Compared>) -> Self {
+        let count = views.len() as f64;
+        let seconds: f64 = views.iter().map(|view| view.seconds).sum();
+        let pixels: usize = views.iter().map(|view| view.pixels).sum();
+        let evaluations = views.iter().fold(Evaluations::default(), |sum, view| sum + view.evaluations);
+        let per_pixel = |count: u64| count as f64 / pixels as f64;
+        let per_view: Vec<Score> = views.into_iter().map(|view| view.score).collect();
+        Report {
+            threads: machines.iter().map(|machine| machine.threads).collect(),
+            processor: machines.into_iter().map(|machine| machine.processor).collect(),
+            psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),
+            ssim_mean: mean(per_view.iter().map(|score| score.ssim)),
+            lpips: weights
+                .map(|weights| Perceived { lpips_mean: mean(per_view.iter().map(|score| score.lpips)), weights }),
+            seconds_per_view: seconds / count,
+            density_per_pixel: per_pixel(evaluations.density),
+            color_per_pixel: per_pixel(evaluations.color),
+            unskipped_per_pixel: per_pixel(evaluations.unskipped),
+            conditions,
+            per_view,
+        }
+    }
+
     /// The indices of the drawn views: evenly spaced ones, and the worst.
     pub fn drawn(&self) -> BTreeSet<usize> {
-        regular(self.views).into_iter().chain(self.worst()).collect()
+        regular(self.per_view.len()).into_iter().chain(self.worst()).collect()
     }
 
     /// The indices of the worst views, worst first.
     pub fn worst(&self) -> Vec<usize> {
-        let mut order = self.by_psnr();
-        order.truncate(WORST);
-        order
+        worst(&self.per_view.iter().map(|score| score.psnr).collect::<Vec<_>>())
     }
 
     /// The indices of all views, sorted by PSNR. NaN comes first.
     pub fn by_psnr(&self) -> Vec<usize> {
-        let mut order: Vec<usize> = (0..self.per_view.len()).collect();
-        let psnr = |i: &usize| self.per_view[*i].psnr;
-        order.sort_by(|a, b| psnr(b).is_nan().cmp(&psnr(a).is_nan()).then(psnr(a).total_cmp(&psnr(b))));
-        order
+        by_psnr(&self.per_view.iter().map(|score| score.psnr).collect::<Vec<_>>())
     }
 }
 
+/// The indices of the worst PSNRs, worst first.
+pub fn worst(psnr: &[f64]) -> Vec<usize> {
+    let mut order = by_psnr(psnr);
+    order.truncate(WORST);
+    order
+}
+
+fn by_psnr(all: &[f64]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..all.len()).collect();
+    let psnr = |i: &usize| all[*i];
+    order.sort_by(|a, b| psnr(b).is_nan().cmp(&psnr(a).is_nan()).then(psnr(a).total_cmp(&psnr(b))));
+    order
+}
+
+/// The mean; `None` if there are no values or one is missing.
+fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
+    let count = values.len();
+    let sum: Option<f64> = values.sum();
+    sum.filter(|_| count > 0).map(|sum| sum / count as f64)
+}
+
 /// Scores of one view.
-#[derive(Serialize)]
+#[derive(Serialize, Deserialize)]
 pub struct Score {
     pub name: String,
-    #[serde(serialize_with = "number")]
+    #[serde(serialize_with = "number", deserialize_with = "read_number")]
     pub psnr: f64,
-    #[serde(serialize_with = "some")]
+    #[serde(serialize_with = "some", deserialize_with = "read_some")]
     pub ssim: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "some")]
+    #[serde(default, skip_serializing_if = "Option::is_none", serialize_with = "some", deserialize_with = "read_some")]
     pub lpips: Option<f64>,
 }
 
@@ -176,6 +258,31 @@ fn number<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> 
     if value.is_finite() { serializer.serialize_f64(*value) } else { serializer.collect_str(value) }
 }
 
+/// A number as [`number`] serialises it.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Stored {
+    Finite(f64),
+    Other(String),
+}
+
+impl Stored {
+    fn value<E: serde::de::Error>(self) -> Result<f64, E> {
+        match self {
+            Stored::Finite(value) => Ok(value),
+            Stored::Other(text) => text.parse().map_err(E::custom),
+        }
+    }
+}
+
+fn read_number<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Stored::deserialize(from)?.value()
+}
+
+fn read_some<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
+    Option::<Stored>::deserialize(from)?.map(Stored::value).transpose()
+}
+
 impl fmt::Display for Score {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} ({:.2} dB)", self.name, self.psnr)
@@ -189,7 +296,7 @@ pub fn four_digits(value: Option<f64>) -> String {
 
 /// The report as a table for a terminal.
 pub fn table(report: &Report) -> String {
-    let mean_of = format!("mean of {}", report.views);
+    let mean_of = format!("mean of {}", report.per_view.len());
     let names = report.per_view.iter().map(|score| score.name.len());
     let width = names.chain([mean_of.len()]).max().unwrap_or(0);
     let row = |[name, psnr, ssim, lpips]: [&str; 4]| match report.lpips {
@@ -205,23 +312,24 @@ pub fn table(report: &Report) -> String {
     }
     let lpips_mean = report.lpips.as_ref().and_then(|lpips| lpips.lpips_mean);
     text += &figures(&mean_of, report.psnr_mean, report.ssim_mean, lpips_mean);
-    let Report { split, hold_out, background, seconds_per_view, .. } = report;
-    let size = format!("{}x{}", report.width, report.height);
+    let Report { conditions, seconds_per_view, .. } = report;
+    let Conditions { split, hold_out, background, width: columns, height, .. } = conditions;
+    let size = format!("{columns}x{height}");
     text += &format!(
         "{split} images ({hold_out}), {size}, {background} background, {seconds_per_view:.2} s to render each\n"
     );
     let worst: Vec<String> = report.worst().iter().map(|&i| report.per_view[i].to_string()).collect();
     text += &format!("worst: {}\n", worst.join(", "));
-    if let Some(Perceived { lpips_backbone, lpips_crc32, .. }) = &report.lpips {
+    if let Some(Perceived { weights: Weights { lpips_backbone, lpips_crc32 }, .. }) = &report.lpips {
         text += &format!("LPIPS: {lpips_backbone}, weights CRC-32 {lpips_crc32}\n");
     }
-    text += match report.appearance {
+    text += match conditions.appearance {
         Appearance::None => "",
         Appearance::Own => "exposure and appearance embeddings: each image's own\n",
         Appearance::Mean => "exposure and appearance embeddings: mean of the training images\n",
         Appearance::Half => "compared: right halves, with exposure fitted to the left halves\n",
     };
-    text + match report.cameras {
+    text + match conditions.cameras {
         Alignment::None => "",
         Alignment::Learned => "cameras: as learned\n",
         Alignment::Fitted => "cameras: each aligned to its own image\n",
@@ -233,6 +341,7 @@ pub fn table(report: &Report) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::cmp::Ordering;
 
     #[test]
     fn non_finite_numbers_serialise_as_strings() {
@@ -242,6 +351,9 @@ mod tests {
             assert_eq!(of(psnr, None, None), format!("{{\"name\":\"a\",\"psnr\":{expected},\"ssim\":null}}"));
             let all = format!("{{\"name\":\"a\",\"psnr\":1.0,\"ssim\":{expected},\"lpips\":{expected}}}");
             assert_eq!(of(1.0, Some(psnr), Some(psnr)), all);
+            let read: Score = serde_json::from_str(&all).unwrap();
+            assert_eq!(read.ssim.unwrap().total_cmp(&psnr), Ordering::Equal);
+            assert!(read.psnr == 1.0 && read.lpips.unwrap().total_cmp(&psnr) == Ordering::Equal);
         }
     }
 }

@@ -7,15 +7,19 @@ use clap::ValueEnum;
 use raygrad::nerf::dataset::formats::colmap::Encoding;
 use raygrad::nerf::dataset::formats::{blender, colmap, llff, transforms};
 use raygrad::nerf::dataset::{Capture, Depths, Format, Photo, Split, View};
-use raygrad::nerf::{Camera, Error, Result};
+use raygrad::nerf::{Camera, Error, Result, create_folder, rename_durable};
+use raygrad::nn::TEMPORARY_PREFIX;
+use serde_json::{Value, json};
 
-use super::bounds;
 use super::root::Root;
 use super::undistort;
 use super::workplace::Workplace;
+use super::{bounds, next};
 use crate::interrupt::Work;
-use crate::output::{complain, note, print};
+use crate::merge;
+use crate::output::{complain, entries, note, print, remove};
 use crate::progress::Progress;
+use crate::shard::{self, Complete, Part, Shard, Whole};
 
 /// Formats that can be written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -102,46 +106,161 @@ struct Job {
     seen_by: Option<Camera>,
 }
 
-/// Converts a capture to another format in `out`, with images. Without `outside`, files outside of the capture's folder
-/// are refused. A capture may name any file, and those who receive the dataset could read it.
-pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside: bool, out: &Path) -> Work<()> {
-    if undistorted || target == Target::Llff {
-        // The format cannot hold views without images.
-        capture.views.retain(|view| view.image.is_some());
+/// A conversion to another format.
+pub struct Conversion {
+    pub capture: Capture,
+    pub target: Target,
+    pub undistort: bool,
+    /// Whether files outside of the capture's folder may be copied. A capture may name any file, and those who receive
+    /// the dataset could read it.
+    pub allow_outside: bool,
+}
+
+impl Conversion {
+    /// Writes the dataset, with images, to `out`.
+    pub fn run(mut self, out: &Path) -> Work<()> {
+        self.check()?;
+        let place = Workplace::new(out)?;
+        let jobs = self.write(place.folder())?;
+        let costs: Vec<u64> = jobs.iter().map(|job| job.from.decoding_memory()).collect();
+        Progress::new().each(&costs, "images written", |i| Ok(jobs[i].run()?))?;
+        place.finish()?;
+        Ok(describe(&self.capture, &jobs, out)?)
     }
-    if capture.present().next().is_none() && undistorted {
-        return Err(Error::file(&capture.file, "none of its images exists: check their paths").into());
-    }
-    for view in &mut capture.views {
-        // Images may be smaller than the camera file states. The target needs the actual size.
-        if view.image.is_some() {
-            view.camera = view.camera_of_image().map_err(|e| Error::field(&capture.file, &view.field, e))?;
+
+    /// Writes the images of one shard, and all other files. [`merge`] moves them to `out`.
+    pub fn run_shard(mut self, out: &Path, shard: Shard) -> Work<()> {
+        self.check()?;
+        let at = staging(out)?;
+        if out.symlink_metadata().is_ok() {
+            return Err(Error::file(out, "exists: choose another --out, or leave out --shard").into());
         }
+        let view = |view: &View| {
+            let has = [view.image.is_some(), view.mask.is_some(), view.depth.is_some()];
+            json!((&view.name, &view.camera, view.split, has)).to_string()
+        };
+        let views: String = self.capture.views.iter().map(view).collect();
+        let inputs = json!({
+            "raygrad": env!("CARGO_PKG_VERSION"),
+            "input": source(&self.capture).to_string_lossy(),
+            "images": format!("{:08x}", crc32fast::hash(views.as_bytes())),
+            "to": self.target.to_possible_value().map(|value| value.get_name().to_owned()),
+            "undistort": self.undistort,
+            "allow_outside": self.allow_outside,
+        });
+        let whole = Whole { command: COMMAND.to_owned(), inputs, items: self.capture.views.len() };
+        let mut part = Part::open(&at, shard, whole, Value::Null)?;
+        let folder = at.join(DATASET);
+        create_folder(&folder)?;
+        let jobs = self.write(&folder)?;
+        let items: Vec<usize> = part.items().skip(part.done()).collect();
+        let progress = Progress::new();
+        for items in items.chunks(4 * rayon::current_num_threads()) {
+            let costs: Vec<u64> = items.iter().map(|&i| jobs[i].from.decoding_memory()).collect();
+            progress.each(&costs, "images written", |i| Ok(jobs[items[i]].run()?))?;
+            items.iter().try_for_each(|&i| jobs[i].sync())?;
+            part.advance(items.len())?;
+        }
+        drop(progress);
+        part.finish();
+        merge::merge_if_complete(&at, shard)
     }
-    if !outside {
-        check_inside(&capture)?;
+
+    /// Reduces the capture to the views that can be written, with the cameras of their images.
+    fn check(&mut self) -> Result<()> {
+        let Conversion { capture, target, undistort, allow_outside } = self;
+        if *undistort || *target == Target::Llff {
+            // The format cannot hold views without images.
+            capture.views.retain(|view| view.image.is_some());
+        }
+        if capture.present().next().is_none() && *undistort {
+            return Err(Error::file(&capture.file, "none of its images exists: check their paths"));
+        }
+        for view in &mut capture.views {
+            // Images may be smaller than the camera file states. The target needs the actual size.
+            if view.image.is_some() {
+                view.camera = view.camera_of_image().map_err(|e| Error::field(&capture.file, &view.field, e))?;
+            }
+        }
+        if *allow_outside { Ok(()) } else { check_inside(capture) }
     }
-    let place = Workplace::new(out)?;
-    let mut jobs = jobs(&capture, target, undistorted, place.folder())?;
-    if undistorted {
-        undistort::plan(&mut jobs.iter_mut().map(|job| (&mut job.to.camera, &mut job.seen_by)), target.is_plain())?;
+
+    /// Writes all files to a folder, except for the images. Returns what is to be done with each image.
+    fn write(&self, folder: &Path) -> Result<Vec<Job>> {
+        let Conversion { capture, target, undistort, .. } = self;
+        let mut jobs = jobs(capture, *target, *undistort, folder)?;
+        if *undistort {
+            undistort::plan(&mut jobs.iter_mut().map(|job| (&mut job.to.camera, &mut job.seen_by)), target.is_plain())?;
+        }
+        let mut guessed = 0;
+        if *target == Target::Llff {
+            let bounds;
+            (bounds, guessed) = bounds::of(capture)?;
+            jobs.iter_mut().zip(bounds).for_each(|(job, bounds)| job.to.bounds = Some(bounds));
+        }
+        let views = jobs.iter().map(|job| job.to.clone()).collect();
+        let written = Capture { folder: folder.into(), views, ..capture.clone() };
+        // Written first, so that unsupported features fail before images are copied.
+        target.write(&written, folder)?;
+        if guessed > 0 {
+            note(&format!(
+                "{guessed} images see too few points for a depth range: raygrad wrote that of the scene box"
+            ));
+        }
+        Ok(jobs)
     }
-    let mut guessed = 0;
-    if target == Target::Llff {
-        let bounds;
-        (bounds, guessed) = bounds::of(&capture)?;
-        jobs.iter_mut().zip(bounds).for_each(|(job, bounds)| job.to.bounds = Some(bounds));
+}
+
+/// The name of the command in records.
+pub const COMMAND: &str = "prepare";
+/// The folder of the dataset in [`staging`].
+const DATASET: &str = "dataset";
+
+/// The folder of unfinished shards of a dataset, beside it.
+pub fn staging(out: &Path) -> Result<PathBuf> {
+    let absolute = std::path::absolute(out).map_err(|e| Error::file(out, e))?;
+    let name = absolute.file_name().and_then(|name| name.to_str());
+    let name = name.ok_or_else(|| Error::file(out, "is not a folder name in Unicode: choose another --out"))?;
+    Ok(absolute.with_file_name(format!(".{name}{STAGED}")))
+}
+
+/// The end of the name of [`staging`].
+const STAGED: &str = "-unfinished-shards";
+
+/// Makes the dataset of complete shards.
+pub fn merge(complete: Complete) -> Work<()> {
+    let at = complete.at().to_owned();
+    let name = at.file_name().and_then(|name| name.to_str());
+    let name = name.and_then(|name| name.strip_prefix('.')?.strip_suffix(STAGED));
+    let out = at.with_file_name(name.ok_or_else(|| Error::file(&at, "was renamed: name it as before"))?);
+    let dataset = at.join(DATASET);
+    // It is absent if an earlier merge was killed after it.
+    if dataset.exists() {
+        if out.symlink_metadata().is_ok() {
+            return Err(Error::file(&out, "exists: move it away, then run `raygrad merge` again").into());
+        }
+        remove_temporary(&dataset)?;
+        rename_durable(&dataset, &out)?;
     }
-    let views = jobs.iter().map(|job| job.to.clone()).collect();
-    let written = Capture { folder: place.folder().into(), views, ..capture.clone() };
-    // Written first, so that unsupported features fail before images are copied.
-    target.write(&written, place.folder())?;
-    let costs: Vec<u64> = jobs.iter().map(|job| job.from.decoding_memory()).collect();
-    Progress::new().each(&costs, "images written", |i| Ok(jobs[i].run()?))?;
-    place.finish()?;
-    describe(&capture, &jobs, out)?;
-    if guessed > 0 {
-        note(&format!("{guessed} images see too few points for a depth range: raygrad wrote that of the scene box"));
+    shard::clear(&at);
+    let images = complete.whole.items;
+    complete.lock.remove();
+    if let Err(e) = std::fs::remove_dir_all(&at) {
+        complain(&format!("warning: {}: cannot be removed: {e}", at.display()));
+    }
+    let out = out.display();
+    print(&format!("scene    {out}: {images} cameras\n"))?;
+    Ok(next(out)?)
+}
+
+/// Removes the temporary files that killed shards left in a dataset.
+fn remove_temporary(folder: &Path) -> Result<()> {
+    for path in entries(folder)? {
+        if path.is_dir() {
+            remove_temporary(&path)?;
+        } else if path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(TEMPORARY_PREFIX)) {
+            remove(&[path]);
+        }
     }
     Ok(())
 }
@@ -159,6 +278,12 @@ fn check_inside(capture: &Capture) -> Result<()> {
     points.map_err(|what| Error::file(&capture.file, what))
 }
 
+/// The folder or the built-in scene that a capture is from.
+fn source(capture: &Capture) -> &Path {
+    // The images of a built-in scene have only been in a temporary folder.
+    if capture.file.starts_with(&capture.folder) { &capture.folder } else { &capture.file }
+}
+
 fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
     let changed = jobs.iter().filter(|job| job.seen_by.is_some()).count();
     let copied = jobs.iter().filter(|job| job.from.image.is_some()).count() - changed;
@@ -169,9 +294,7 @@ fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
             parts.push(format!("{count} {what}"));
         }
     }
-    // The images of a built-in scene have only been in a temporary folder.
-    let from = if capture.file.starts_with(&capture.folder) { &capture.folder } else { &capture.file };
-    print(&format!("capture  {} ({})\n", from.display(), capture.format))?;
+    print(&format!("capture  {} ({})\n", source(capture).display(), capture.format))?;
     if let Some(Camera { width, height, .. }) = jobs.iter().find_map(|job| job.seen_by.as_ref()) {
         parts.push(format!("the first to {width}x{height}"));
     }
@@ -265,6 +388,16 @@ fn inner(path: &str) -> &str {
 }
 
 impl Job {
+    /// Flushes the files, which a record then counts as complete.
+    fn sync(&self) -> Result<()> {
+        let depth = self.to.depth.as_ref().map(|(path, _)| path);
+        let files = [self.to.image.as_ref(), self.to.mask.as_ref(), depth].into_iter().flatten();
+        files.filter(|path| path.is_file()).try_for_each(|path| {
+            let synced = std::fs::File::open(path).and_then(|file| file.sync_all());
+            synced.map_err(|e| Error::file(path, format!("cannot be written: {e}")))
+        })
+    }
+
     fn run(&self) -> Result<()> {
         let Job { from, to, seen_by } = self;
         // The file is copied unchanged, so its content is checked.

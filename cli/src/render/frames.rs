@@ -4,28 +4,42 @@ use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Result, create_folder, write_atomic};
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::shown::Layer;
-use crate::lock::{Lock, State};
-use crate::output::{complain, make_folder, note, numbered, other_numbered, parent, remove};
+use crate::lock::{Lock, State, UNFINISHED};
+use crate::output::{complain, make_folder, note, numbered, other_numbered, parent, print, remove};
 use crate::overwrite::{Job, png_with_text, taken};
 use crate::parse::read_text;
 use crate::run::write_json;
+use crate::shard::{self, Complete, Part, Shard, Whole};
 
 /// Digits of a frame number.
 pub const DIGITS: usize = 4;
 /// The file that describes the frames of a folder until all are complete.
 const RECORD: &str = "unfinished.json";
-/// Lock file of a program that writes frames.
-const LOCK: &str = "unfinished.lock";
 
 /// The frames of a path, some of which may exist.
 pub struct Frames {
     folder: PathBuf,
-    record: Record,
     job: Job,
-    lock: Lock,
+    /// Number of frames of the path.
+    count: usize,
+    claim: Claim,
+}
+
+/// The frames that a program may write.
+enum Claim {
+    All(Record, Lock),
+    Shard(Part),
+}
+
+/// Facts of a shard's program.
+#[derive(Debug, Serialize, Deserialize)]
+struct Facts {
+    job: Job,
+    /// As in [`Record`]. Images of another shard do not count, so one shard that saw none is right.
+    strange: bool,
 }
 
 /// The contents of the record file.
@@ -52,11 +66,14 @@ impl Frames {
     /// Fails if another job has written one of the files, the folder is not writable, or another program writes frames
     /// there.
     pub fn new(folder: PathBuf, of: Value, job: &Job, count: usize, save: &[Layer]) -> Result<Self> {
+        shard::check_none(&folder)?;
         check(&folder, record(&folder).as_ref(), &of, job, count, save)?;
         make_folder(&folder)?;
-        let lock = Lock::take(&folder.join(LOCK), || {
+        let lock = Lock::take(&folder.join(UNFINISHED), || {
             Error::file(&folder, "another raygrad is rendering to it: wait until it ends")
         })?;
+        // A shard may have begun meanwhile.
+        shard::check_none(&folder)?;
         let left = record(&folder);
         let strange = match &left {
             Some(left) => left.strange,
@@ -68,16 +85,86 @@ impl Frames {
             note(&format!("{}: replacing {done} frames that were rendered with another {others}", folder.display()));
         }
         let done = left.filter(|left| left.of == of).map_or(0, |left| left.done);
-        let record = Record { of, job: job.mark().to_owned(), done: 0, strange };
-        let mut frames = Frames { folder, record, job: job.clone(), lock };
-        frames.record.done = (0..done).take_while(|&frame| frames.path(frame).is_file()).count();
+        let done = (0..done).take_while(|&frame| path(&folder, frame).is_file()).count();
+        let record = Record { of, job: job.mark().to_owned(), done, strange };
+        let frames = Frames { folder, job: job.clone(), count, claim: Claim::All(record, lock) };
         frames.write()?;
         Ok(frames)
     }
 
-    /// Number of complete frames, from the first.
+    /// Opens the frames of one shard. See [`new`](Self::new) and [`Part::open`].
+    pub fn of_shard(folder: PathBuf, shard: Shard, whole: Whole, job: &Job, save: &[Layer]) -> Result<Self> {
+        let (count, begun) = (whole.items, shard::own_facts::<Facts>(&folder)?);
+        if begun.is_empty() {
+            if folder.join(RECORD).exists() {
+                let what = format!(
+                    "holds unfinished frames of a render without shards: finish it without --shard, or remove {}",
+                    folder.join(RECORD).display()
+                );
+                return Err(Error::file(&folder, what));
+            }
+            check(&folder, None, &Value::Null, job, count, save)?;
+        }
+        let strange = match begun.is_empty() {
+            true => !other_numbered(&folder, DIGITS, &[]).is_empty(),
+            false => begun.iter().all(|facts| facts.strange),
+        };
+        let mut part = Part::open(&folder, shard, whole, json!(Facts { job: job.clone(), strange }))?;
+        part.retain(|frame| path(&folder, frame).is_file())?;
+        Ok(Frames { folder, job: job.clone(), count, claim: Claim::Shard(part) })
+    }
+
+    /// The frames of complete shards, made from `of`. Returns them with their job.
+    pub fn of_shards(complete: Complete, of: Value) -> Result<(Self, Job)> {
+        let (folder, count) = (complete.at().to_owned(), complete.whole.items);
+        (0..count).try_for_each(|frame| complete.check(frame, &path(&folder, frame)))?;
+        let facts: Vec<Facts> = complete.own()?;
+        let strange = facts.iter().all(|facts| facts.strange);
+        let Some(Facts { job, .. }) = facts.into_iter().next() else {
+            return Err(Error::file(&folder, "holds no shards"));
+        };
+        let record = Record { of, job: job.mark().to_owned(), done: count, strange };
+        let claim = Claim::All(record, complete.lock);
+        Ok((Frames { folder, job: job.clone(), count, claim }, job))
+    }
+
+    /// Replaces the records of shards by one of all frames.
+    pub fn drop_shards(&self) -> Result<()> {
+        if self.folder.join(shard::FOLDER).is_dir() {
+            self.write()?;
+            shard::clear(&self.folder);
+        }
+        Ok(())
+    }
+
+    /// Prints that the work was interrupted. `again` is how to resume it.
+    pub fn stopped(&self, again: &str) -> Result<()> {
+        let (done, all, folder) = (self.done(), self.count(), self.folder.display());
+        print(&format!("stopped  after {done} of {all} frames, in {folder}: {again} to resume\n"))
+    }
+
+    /// Number of complete frames, from the first that is the program's.
     pub fn done(&self) -> usize {
-        self.record.done
+        match &self.claim {
+            Claim::All(record, _) => record.done,
+            Claim::Shard(part) => part.done(),
+        }
+    }
+
+    /// Number of frames that are the program's.
+    pub fn count(&self) -> usize {
+        match &self.claim {
+            Claim::All(..) => self.count,
+            Claim::Shard(part) => part.items().len(),
+        }
+    }
+
+    /// The next frame to render.
+    pub fn next(&self) -> Option<usize> {
+        match &self.claim {
+            Claim::All(record, _) => Some(record.done).filter(|frame| *frame < self.count),
+            Claim::Shard(part) => part.next(),
+        }
     }
 
     /// The folder.
@@ -85,27 +172,38 @@ impl Frames {
         &self.folder
     }
 
-    /// Writes the next frame: its layers first, then the image.
-    pub fn push(&mut self, picture: &[u8], layers: &[(Layer, Vec<u8>)]) -> Result<()> {
-        let path = self.path(self.record.done);
+    /// Writes a frame, which is the [`next`](Self::next) one: its layers first, then the image.
+    pub fn push(&mut self, frame: usize, picture: &[u8], layers: &[(Layer, Vec<u8>)]) -> Result<()> {
+        let path = path(&self.folder, frame);
         // A file may have appeared meanwhile.
         self.job.check(&path)?;
         for (layer, bytes) in layers {
-            let file = beside(&self.folder, self.record.done, *layer);
+            let file = beside(&self.folder, frame, *layer);
             let folder = parent(&file);
             self.check_lock()?;
             create_folder(folder)?;
-            write_atomic(file, bytes)?;
+            self.put(&file, bytes)?;
         }
-        self.check_lock()?;
-        write_atomic(path, &png_with_text(picture, self.job.mark()))?;
-        self.record.done += 1;
+        self.put(&path, &png_with_text(picture, self.job.mark()))?;
+        match &mut self.claim {
+            Claim::All(record, _) => record.done += 1,
+            Claim::Shard(part) => return part.advance(1),
+        }
         self.write()
+    }
+
+    fn put(&self, path: &Path, bytes: &[u8]) -> Result<()> {
+        self.check_lock()?;
+        match &self.claim {
+            Claim::All(..) => write_atomic(path, bytes),
+            Claim::Shard(part) => part.write(path, bytes),
+        }
     }
 
     /// Checks that the folder is still the locked one.
     fn check_lock(&self) -> Result<()> {
-        let what = match self.lock.state() {
+        let Claim::All(_, lock) = &self.claim else { return Ok(()) };
+        let what = match lock.state() {
             State::Kept => return Ok(()),
             State::Gone => "was removed or moved during rendering: run the same command to start again",
             State::Lost => "another raygrad now renders to it, so this one stopped",
@@ -118,35 +216,44 @@ impl Frames {
         if self.check_lock().is_err() {
             return;
         }
-        remove(&[self.folder.join(RECORD)]);
-        self.lock.remove();
+        match self.claim {
+            Claim::All(_, lock) => {
+                remove(&[self.folder.join(RECORD)]);
+                lock.remove();
+            }
+            Claim::Shard(part) => part.finish(),
+        }
     }
 
     /// Removes all frames, and the folder if it is empty then. Keeps everything if numbered images existed before.
     pub fn remove(self) {
+        let is_strange = matches!(&self.claim, Claim::All(record, _) if record.strange);
         if self.check_lock().is_err() {
             return;
         }
-        if self.record.strange {
+        if is_strange {
             note(&format!("{}: kept, because it held other images before", self.folder.display()));
             return self.keep();
         }
         remove(&other_numbered(&self.folder, DIGITS, &[]));
-        remove(&[self.folder.join(RECORD)]);
-        self.lock.remove();
-        if let Err(e) = std::fs::remove_dir(&self.folder) {
-            complain(&format!("{}: cannot be removed: {e}", self.folder.display()));
+        let folder = self.folder.clone();
+        self.keep();
+        if let Err(e) = std::fs::remove_dir(&folder) {
+            complain(&format!("{}: cannot be removed: {e}", folder.display()));
         }
     }
 
-    fn path(&self, frame: usize) -> PathBuf {
-        self.folder.join(numbered(frame, DIGITS))
-    }
-
+    /// Writes the record of all frames.
     fn write(&self) -> Result<()> {
+        let Claim::All(record, _) = &self.claim else { return Ok(()) };
         self.check_lock()?;
-        write_json(&self.folder.join(RECORD), &self.record)
+        write_json(&self.folder.join(RECORD), record)
     }
+}
+
+/// The file of a frame.
+fn path(folder: &Path, frame: usize) -> PathBuf {
+    folder.join(numbered(frame, DIGITS))
 }
 
 /// The record of a folder; `None` if it cannot be read.
@@ -212,7 +319,7 @@ mod tests {
         let begin = |model: u32| frames(&folder, model);
         let mut first = begin(1);
         for i in 0..3_u8 {
-            first.push(&[i], &[(Layer::DepthNpy, vec![10 + i])]).unwrap();
+            first.push(i.into(), &[i], &[(Layer::DepthNpy, vec![10 + i])]).unwrap();
         }
         let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
         assert_eq!((read("0002.png")[0], read("depth/0002.npy")), (2, vec![12]));
@@ -222,7 +329,7 @@ mod tests {
         std::fs::remove_file(folder.join("0001.png")).unwrap();
         let mut again = begin(1);
         assert_eq!(again.done(), 1);
-        again.push(&[7], &[]).unwrap();
+        again.push(1, &[7], &[]).unwrap();
         assert_eq!(read("0001.png")[0], 7);
         drop(again);
         assert_eq!(begin(2).done(), 0);
@@ -242,7 +349,7 @@ mod tests {
         begin(3).remove();
         assert!(folder.join("0002.png").exists());
         std::fs::remove_dir_all(&folder).unwrap();
-        begin(3).push(&[1], &[]).unwrap();
+        begin(3).push(0, &[1], &[]).unwrap();
         begin(3).remove();
         assert!(!folder.exists());
     }
@@ -269,7 +376,7 @@ mod tests {
         let refused = |job: &Job, save: &[Layer], name: &str| {
             let error = new(job, save).unwrap_err().to_string();
             assert!(error.starts_with(&format!("{}: exists, and", folder.join(name).display())), "{error}");
-            let left = [RECORD, LOCK].map(|name| folder.join(name).exists());
+            let left = [RECORD, UNFINISHED].map(|name| folder.join(name).exists());
             assert_eq!(left, [false; 2], "nothing is left there");
         };
         // Numbered images of the user: one within the range is refused, later ones are not.
@@ -288,7 +395,7 @@ mod tests {
         // Finished frames and layers of the same job are replaced, those of another job are not.
         let mut frames = Frames::new(folder.into(), of(&job(0, false)), &job(0, false), 3, &[Layer::Depth]).unwrap();
         for i in 0..3_u8 {
-            frames.push(&[i], &[(Layer::Depth, vec![i])]).unwrap();
+            frames.push(i.into(), &[i], &[(Layer::Depth, vec![i])]).unwrap();
         }
         frames.keep();
         refused(&job(1, false), &[], "0000.png");
@@ -304,7 +411,7 @@ mod tests {
         let mut frames = Frames::new(folder.into(), of(&job(1, true)), &job(2, false), 3, &[]).unwrap();
         assert_eq!(frames.done(), 0);
         std::fs::write(folder.join("0000.png"), b"photograph").unwrap();
-        assert!(frames.push(&[1], &[]).unwrap_err().to_string().contains("0000.png: exists"));
+        assert!(frames.push(0, &[1], &[]).unwrap_err().to_string().contains("0000.png: exists"));
         assert_eq!(std::fs::read(folder.join("0000.png")).unwrap(), b"photograph");
     }
 
@@ -314,18 +421,20 @@ mod tests {
         let folder = place.path().join("frames");
         let mut first = frames(&folder, 1);
         std::fs::rename(&folder, place.path().join("moved")).unwrap();
-        assert!(first.push(&[0], &[]).unwrap_err().to_string().contains("was removed or moved during rendering"));
+        assert!(first.push(0, &[0], &[]).unwrap_err().to_string().contains("was removed or moved during rendering"));
         let mut second = frames(&folder, 2);
         for layers in [vec![], vec![(Layer::Depth, vec![1])]] {
-            assert!(first.push(&[1], &layers).unwrap_err().to_string().contains("another raygrad now renders to it"));
+            assert!(
+                first.push(0, &[1], &layers).unwrap_err().to_string().contains("another raygrad now renders to it")
+            );
         }
-        second.push(&[2], &[]).unwrap();
+        second.push(0, &[2], &[]).unwrap();
         // Files of the other program are not removed.
         first.remove();
         // A frame, the record, and the two files of a lock.
         assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 4);
         let third = frames(&place.path().join("moved"), 1);
-        let lock = crate::lock::owner_of(&place.path().join("moved").join(LOCK));
+        let lock = crate::lock::owner_of(&place.path().join("moved").join(UNFINISHED));
         std::fs::write(lock, "1 0123456789abcdef\n").unwrap();
         third.keep();
         assert_eq!(std::fs::read_dir(place.path().join("moved")).unwrap().count(), 3, "nor kept by who has lost it");

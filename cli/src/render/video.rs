@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use clap::ValueEnum;
 use raygrad::nerf::{Error, Image, Result, rename_durable};
 use raygrad::nn::TEMPORARY_PREFIX;
+use serde::{Deserialize, Serialize};
 
 use super::animation::Animation;
 use super::frames::DIGITS;
@@ -25,7 +26,8 @@ const FASTEST_GIF: f64 = 50.0;
 const IN_FILM: &str = "frames encoded";
 
 /// Video file formats.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum VideoFormat {
     Gif,
     Apng,
@@ -167,8 +169,19 @@ fn animate(
 /// The folder of a video's frames, beside the video.
 pub fn frames_of(video: &Path) -> PathBuf {
     let mut name = video.as_os_str().to_owned();
-    name.push(".frames");
+    name.push(FRAMES);
     name.into()
+}
+
+/// The end of the name of [`frames_of`].
+const FRAMES: &str = ".frames";
+
+/// The video of a folder of frames: the inverse of [`frames_of`].
+pub fn video_of(frames: &Path) -> Result<PathBuf> {
+    if frames.extension().is_some_and(|ending| *ending == FRAMES[1..]) {
+        return Ok(frames.with_extension(""));
+    }
+    Err(Error::file(frames, format!("was renamed: name it as its video, with {FRAMES} at the end")))
 }
 
 #[cfg(test)]

@@ -41,6 +41,8 @@ mod records;
 #[cfg(unix)]
 mod resume;
 #[cfg(unix)]
+mod shards;
+#[cfg(unix)]
 mod signals;
 #[cfg(unix)]
 mod view;

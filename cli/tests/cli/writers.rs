@@ -21,7 +21,7 @@ const fn writer(command: &'static str, result: &'static str) -> Writer {
     Writer { command, result, is_gradual: false }
 }
 
-const WRITERS: [Writer; 9] = [
+const WRITERS: [Writer; 10] = [
     writer("render run --path orbit --frames 2 --size 8x6 --out film.gif --overwrite", "film.gif"),
     Writer {
         is_gradual: true,
@@ -34,6 +34,10 @@ const WRITERS: [Writer; 9] = [
     Writer { is_gradual: true, ..writer("eval run", "run") },
     Writer { is_gradual: true, ..writer("doctor scene --out checked --overwrite", "checked") },
     Writer { is_gradual: true, ..writer("bench --suite quadrature --quick --out measured --overwrite", "measured") },
+    Writer {
+        is_gradual: true,
+        ..writer("render run --path orbit --frames 2 --size 8x6 --shard 1/1 --out shards --overwrite", "shards")
+    },
 ];
 
 /// Calls, the errors that they may answer, and the fault.

@@ -8,14 +8,14 @@ use crate::dataset::image::Image;
 use crate::error::{Error, Result};
 use raygrad_autograd::{Conv2dConfig, Pool2dConfig, Scalar, Tape, Tensor, Var};
 use safetensors::tensor::{Dtype, SafeTensors};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
 /// The network whose features LPIPS compares. Distances of different networks are not comparable.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Backbone {
     /// AlexNet: fast.

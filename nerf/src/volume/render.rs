@@ -8,8 +8,10 @@ use crate::field::Density;
 use raygrad_autograd::{Scalar, Segments, Tensor, Var};
 use std::ops::Add;
 
+use serde::{Deserialize, Serialize};
+
 /// Counts of field evaluations.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Evaluations {
     /// Density evaluations.
     pub density: u64,

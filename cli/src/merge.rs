@@ -1,0 +1,71 @@
+//! `raygrad merge`: makes the result of complete shards.
+
+use std::path::{Path, PathBuf};
+
+use raygrad::nerf::Error;
+
+use super::interrupt::{self, Work};
+use super::output::print;
+use super::prepare::convert;
+use super::shard::{self, Complete, Progress, Shard};
+use super::{eval, render};
+
+/// Merge shards of `render`, `eval` or `prepare`
+///
+/// The last shard to finish merges all of them. Use this command if that shard was killed, or if two shards finished at
+/// the same moment on different machines.
+///
+/// Example: raygrad merge orbit.mp4
+#[derive(clap::Args)]
+pub struct Args {
+    /// The --out of the shards, or RUN/eval-SPLIT-SKIP
+    out: PathBuf,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Work<()> {
+    interrupt::listen_to_go_on();
+    let out = &args.out;
+    let mut places = vec![out.clone(), render::frames_of(out)];
+    places.extend(convert::staging(out));
+    let at = places.into_iter().find(|place| place.join(shard::FOLDER).is_dir()).unwrap_or_else(|| out.clone());
+    // The result is beside it, and `.` has no name.
+    let at = if at.file_name().is_none() { at.canonicalize().unwrap_or(at) } else { at };
+    let what = match shard::progress(&at)? {
+        Progress::Complete(complete) => return merge(*complete),
+        Progress::None => {
+            "holds no shards: name the --out of `render` or `prepare`, or the folder RUN/eval-SPLIT-SKIP of `eval`"
+                .into()
+        }
+        Progress::Merging => "another raygrad merges the shards: wait until it ends".into(),
+        Progress::Incomplete(missing) => {
+            format!("misses shards {missing}: wait for those that run, repeat the others with --shard")
+        }
+    };
+    Err(Error::file(out, what).into())
+}
+
+/// Merges the shards in a folder of results if all are complete. Called after `shard` is.
+pub fn merge_if_complete(at: &Path, shard: Shard) -> Work<()> {
+    let rest = match shard::progress(at)? {
+        Progress::Complete(complete) => return merge(*complete),
+        Progress::None => "another raygrad has merged the shards".into(),
+        Progress::Merging => "another raygrad merges the shards".into(),
+        Progress::Incomplete(missing) => format!("still missing {missing}"),
+    };
+    Ok(print(&format!("shard    {shard} is complete; {rest}\n"))?)
+}
+
+fn merge(complete: Complete) -> Work<()> {
+    match complete.whole.command.as_str() {
+        render::COMMAND => render::merge(complete),
+        convert::COMMAND => convert::merge(complete),
+        eval::COMMAND => Ok(eval::merge(complete)?),
+        other => {
+            let what = format!(
+                "holds shards of `raygrad {other}`, which this raygrad cannot merge: use the one that made them"
+            );
+            Err(Error::file(complete.at(), what).into())
+        }
+    }
+}
