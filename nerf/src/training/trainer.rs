@@ -254,8 +254,8 @@ impl Trainer {
         self.done
     }
 
-    /// Checks the poses, once in a run. If refinement hardly moved them, the given ones are right: the drift is undone,
-    /// and training goes on as with fixed cameras, apart from a low learning rate of the poses.
+    /// Checks the poses, once in a run. If refinement hardly moved them, the given ones are right. Training then
+    /// continues from them as with fixed cameras, except for a low learning rate of the poses.
     fn check_poses(&mut self, fraction: f64) {
         let check_at = self.model.config.camera_optimizer.check_at;
         // The steps are those of the model, as a restart begins with the given poses.

@@ -31,7 +31,7 @@ pub struct CameraOptimizerConfig {
     pub coarse: f64,
     /// Share of the run after which the trainer checks the poses. If they moved the images by less than .45 degrees,
     /// the given poses are right: they are restored, all detail is enabled, and their learning rate falls to a
-    /// fiftieth. 0 omits the check. Range: 0 to 1. See [`StepStats::pose_motion`](crate::StepStats::pose_motion).
+    /// fiftieth. 0 omits the check. Range: 0 to 1.
     pub check_at: f64,
 }
 
