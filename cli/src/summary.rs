@@ -80,6 +80,8 @@ struct Summary<'a> {
     /// The last fractions of skipped samples and queries: 0 to 1.
     skipped_share: Option<Shares>,
     restarts: u32,
+    /// Image motion at the check of the poses, in degrees; null without one.
+    pose_motion: Option<f64>,
     /// Number of gradient elements that were not finite.
     non_finite_gradients: u64,
     threads: usize,
@@ -175,6 +177,7 @@ impl Account {
             unskipped: stats.unskipped,
             skipped_share: shares(stats),
             restarts: stats.restarts,
+            pose_motion: stats.pose_motion,
             non_finite_gradients: stats.non_finite,
             threads: rayon::current_num_threads(),
             processor: machine::processor(),
@@ -213,7 +216,7 @@ mod tests {
         // Before the first step.
         let account = Account::open(&run, &at(0));
         let begun = write(&account, &at(0), None);
-        for name in ["ended", "loss", "psnr", "preview", "skipped_share"] {
+        for name in ["ended", "loss", "psnr", "preview", "skipped_share", "pose_motion"] {
             assert_eq!(begun[name], Value::Null, "{name}");
         }
         assert_eq!([&begun["resumed"], &begun["averaged_steps"]], [&json!(0), &json!(0)]);
@@ -231,6 +234,7 @@ mod tests {
             unskipped: 200,
             non_finite: 3,
             restarts: 2,
+            pose_motion: Some(0.5),
             ..at(150)
         };
         let ended = write(&account, &counts, Some(Ended::Interrupted));
@@ -244,6 +248,7 @@ mod tests {
             json!({ "placed_samples": 0.75, "density_queries": 0.8, "color_queries": 0.95 })
         );
         assert_eq!([&ended["non_finite_gradients"], &ended["restarts"]], [&json!(3), &json!(2)]);
+        assert_eq!(ended["pose_motion"], 0.5);
         // After divergence, the run returns to a step before the preview.
         account.retreat();
         account.cut(139);

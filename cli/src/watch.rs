@@ -52,6 +52,8 @@ pub struct Watch<'a> {
     interval: f64,
     next_save: f64,
     psnr: Option<f64>,
+    /// Image motion at the check of the poses, if that was before the last step.
+    pose_motion: Option<f64>,
     progress: Progress,
     /// Warnings about files that were printed already.
     warned: HashSet<String>,
@@ -96,6 +98,7 @@ impl<'a> Watch<'a> {
             interval,
             next_save: train_seconds + interval,
             psnr: None,
+            pose_motion: stats.pose_motion,
             progress: Progress::new(),
             warned: HashSet::new(),
         };
@@ -154,6 +157,10 @@ impl<'a> Watch<'a> {
             let StepStats { step, loss, .. } = stats;
             format!("step {step}  loss {loss:.5}  PSNR {psnr:.2}  {speed:.0} rays/s  {} left", spoken(left))
         });
+        if self.pose_motion != stats.pose_motion {
+            self.pose_motion = stats.pose_motion;
+            pose_check(&stats).into_iter().for_each(|line| self.progress.note(&line));
+        }
         if stats.train_seconds >= self.next_preview {
             self.next_preview = 2.0 * stats.train_seconds.max(self.next_preview);
             self.attempt(|watch| watch.preview(trainer));
@@ -369,6 +376,15 @@ fn kept_metrics(path: &Path, step: u64) -> Result<(String, u64)> {
     Ok((kept, last))
 }
 
+/// The result of the check of the poses, if they have been checked.
+fn pose_check(stats: &StepStats) -> Option<String> {
+    let found = match stats.given_poses_are_right() {
+        true => "the given poses are right, and are hardly refined from here on",
+        false => "the given poses are wrong, and detail fades in while they are refined",
+    };
+    stats.pose_motion.map(|motion| format!("poses    moved images by {motion:.2} degrees: {found}"))
+}
+
 /// Named scalars of the metrics, and the training speed.
 fn scalars(values: &Value, stats: &StepStats) -> Vec<(String, f64)> {
     let named = values.as_object().into_iter().flatten().filter(|(name, _)| *name != "step");
@@ -386,6 +402,15 @@ fn is_logged(step: u64) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn check_of_poses_is_told_with_its_motion() {
+        let told = |pose_motion| pose_check(&StepStats { pose_motion, ..StepStats::default() });
+        assert_eq!(told(None), None);
+        let [right, wrong] = [0.384, 1.9].map(|motion| told(Some(motion)).unwrap());
+        assert!(right.contains("by 0.38 degrees: the given poses are right"), "{right}");
+        assert!(wrong.contains("by 1.90 degrees: the given poses are wrong"), "{wrong}");
+    }
 
     #[test]
     fn kept_metrics_end_at_the_resumed_step() {

@@ -96,7 +96,8 @@ fn refinement_finds_poses_in_a_known_scene() {
     let right = photographs(24, 48, Lens::Pinhole);
     let wrong = disturbed(&right, 2.0, 0.02, 1.0);
     let mut config = instant().with_refined(&[RefinedParam::Poses]);
-    config.camera_optimizer.coarse = 0.0;
+    // The known scene has frozen poses, which would pass a check.
+    (config.camera_optimizer.coarse, config.camera_optimizer.check_at) = (0.0, 0.0);
     config.poses = Some(Schedule::Exponential { from: 5e-3, to: 2e-5, warmup: 0.0 });
     // With some seeds (0 and 3 of 0 to 5) one of the cameras is lost.
     config.seed = 1;
@@ -292,4 +293,20 @@ fn fit_poses_finds_held_out_cameras_alone() {
     println!("off by {before:?} and then by {after:?}");
     assert!(before > 0.6 && after < 0.3 * before, "{before} {after}");
     assert!(found.iter().zip(&given).all(|(a, b)| a.focal == b.focal && a.lens == b.lens));
+}
+
+#[test]
+fn check_of_poses_tells_right_cameras_from_wrong_ones() {
+    let right = photographs(20, 40, Lens::Pinhole);
+    let mut config = instant().with_refined(&[RefinedParam::Poses]);
+    config.sampler.get_mut::<MarchingConfig>().unwrap().samples = 4096;
+    for (degrees, share, expected) in [(0.0, 0.0, true), (2.0, 0.02, false)] {
+        let wrong = disturbed(&right, degrees, share, 1.0);
+        let mut trainer = Trainer::new(config.clone(), Arc::new(wrong)).unwrap();
+        // The first twentieth of a run.
+        (0..=100).for_each(|i| _ = trainer.step(f64::from(i) / 2000.0));
+        println!("{degrees} degrees off: {:?}", trainer.stats().pose_motion);
+        assert!(trainer.stats().pose_motion.is_some());
+        assert_eq!(trainer.stats().given_poses_are_right(), expected);
+    }
 }

@@ -39,15 +39,16 @@ const PROPOSAL_DISTORTION: f64 = 0.002;
 
 /// Learning rates of cameras at the start and the end of a run. Units: radians of image motion, logarithms of focal
 /// lengths, lens coefficients.
-const POSE_RATE: [f64; 2] = [3e-3, 3e-5];
+const POSE_RATE: [f64; 2] = [1e-3, 1e-5];
 const FOCAL_RATE: [f64; 2] = [5e-3, 5e-5];
 const LENS_RATE: [f64; 2] = [1e-3, 1e-5];
 /// Learning rates of the logarithms of gains.
 const TONE_RATE: [f64; 2] = [1e-2, 1e-4];
 /// The share of a run over which these rates rise from 0: cameras would drift before the scene takes shape.
 const CAMERA_WARMUP: f64 = 0.1;
-/// The share of a run over which detail is enabled while poses are learned.
+/// The share of a run over which detail is enabled while poses are learned, and after which poses are checked.
 const COARSE: f64 = 0.4;
+const CHECK_AT: f64 = 0.05;
 
 /// The most images that count as few, and the share of a run over which detail is enabled then.
 const FEW_IMAGES: usize = 16;
@@ -306,22 +307,28 @@ impl Config {
     /// Adapts the configuration to the number of training images.
     ///
     /// Up to 16 images leave much of a scene to chance. Detail then fades in over the first half of the run, from coarse
-    /// to fine (Yang et al. 2023, "FreeNeRF"). Figures are in docs/benchmarks/results.md, section Few images.
+    /// to fine (Yang et al. 2023, "FreeNeRF"), even if poses are right. Figures are in docs/benchmarks/results.md,
+    /// section Few images.
     pub fn with_images(mut self, count: usize) -> Self {
         if count <= FEW_IMAGES {
-            self.camera_optimizer.coarse = FEW_IMAGES_COARSE;
+            (self.camera_optimizer.coarse, self.camera_optimizer.check_at) = (FEW_IMAGES_COARSE, 0.0);
         }
         self
     }
 
     /// Enables refinement of these camera parameters, at learning rates found with `examples/refine.rs`. With
-    /// [`RefinedParam::Poses`], detail is enabled from coarse to fine.
+    /// [`RefinedParam::Poses`], detail is enabled from coarse to fine, unless a
+    /// [check](CameraOptimizerConfig::check_at) finds that the given poses are right.
     pub fn with_refined(mut self, parts: &[RefinedParam]) -> Self {
         let rate = |from: f64, to: f64| Some(Schedule::Exponential { from, to, warmup: CAMERA_WARMUP });
         for part in parts {
             match part {
                 RefinedParam::Poses => {
-                    (self.poses, self.camera_optimizer.coarse) = (rate(POSE_RATE[0], POSE_RATE[1]), COARSE)
+                    self.poses = rate(POSE_RATE[0], POSE_RATE[1]);
+                    // Few images have a schedule of their own.
+                    if self.camera_optimizer.coarse == 0.0 {
+                        (self.camera_optimizer.coarse, self.camera_optimizer.check_at) = (COARSE, CHECK_AT);
+                    }
                 }
                 RefinedParam::Focal => self.camera_optimizer.focal = rate(FOCAL_RATE[0], FOCAL_RATE[1]),
                 RefinedParam::Lens => self.camera_optimizer.lens = rate(LENS_RATE[0], LENS_RATE[1]),
@@ -443,7 +450,7 @@ mod tests {
         let refined = |part| Config::preset(Preset::Instant).with_refined(&[part]);
         let rate = |from, to| Some(Schedule::Exponential { from, to, warmup: 0.1 });
         let expected = [
-            (RefinedParam::Poses, "poses", rate(3e-3, 3e-5)),
+            (RefinedParam::Poses, "poses", rate(1e-3, 1e-5)),
             (RefinedParam::Focal, "focal", rate(5e-3, 5e-5)),
             (RefinedParam::Lens, "lens", rate(1e-3, 1e-5)),
             (RefinedParam::Exposure, "exposure", rate(1e-2, 1e-4)),
@@ -502,6 +509,15 @@ mod tests {
         few.check().unwrap();
         assert_eq!([0.0, 0.25, 0.5, 1.0].map(|fraction| few.camera_optimizer.detail(fraction)), [0.0, 0.5, 1.0, 1.0]);
         assert_eq!(preset.clone().with_images(17), preset);
+        // Refined poses do not change that, in either order.
+        let poses = &[RefinedParam::Poses];
+        let refined = few.with_refined(poses).camera_optimizer;
+        assert_eq!((refined.coarse, refined.check_at), (0.5, 0.0));
+        assert_eq!(preset.clone().with_refined(poses).with_images(16).camera_optimizer, refined);
+        let mut wrong = preset.with_refined(poses);
+        assert_eq!(wrong.camera_optimizer.check_at, 0.05);
+        wrong.camera_optimizer.check_at = 1.5;
+        assert!(wrong.check().unwrap_err().to_string().starts_with("`camera_optimizer.check_at`"));
     }
 
     #[test]

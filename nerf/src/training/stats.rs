@@ -7,6 +7,10 @@ use std::time::Duration;
 /// Consecutive steps without a finite gradient after which a run has diverged. A single overflow may pass.
 pub(crate) const STUCK: u64 = 100;
 
+/// Image motion below which the given poses are right, in degrees. At the usual learning rate, right poses drift by .3
+/// until the check, and poses that are half a degree off move by .55.
+const RIGHT: f64 = 0.45;
+
 /// The length of a run, in steps or time.
 ///
 /// In a file it is `{"steps": 5000}` or `{"seconds": 60}`.
@@ -98,6 +102,10 @@ pub struct StepStats {
     pub non_finite_steps: u64,
     /// Restarts with another seed by the start-up detector.
     pub restarts: u32,
+    /// Image motion by pose refinement up to the [check](crate::model::CameraOptimizerConfig::check_at) of the poses,
+    /// in degrees: see [`CameraOptimizer::pose_motion`](crate::model::CameraOptimizer::pose_motion). `None` before.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pose_motion: Option<f64>,
 }
 
 /// Reads a number; null, as files write non-finite ones, is NaN.
@@ -106,6 +114,12 @@ fn number_or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::E
 }
 
 impl StepStats {
+    /// Returns whether the check of the poses found the given ones right: they moved images by less than .45
+    /// degrees.
+    pub fn given_poses_are_right(&self) -> bool {
+        self.pose_motion.is_some_and(|motion| motion < RIGHT)
+    }
+
     /// Returns whether the run has diverged: no gradient was finite for 100 consecutive steps. Its model is useless.
     pub fn has_diverged(&self) -> bool {
         self.non_finite_steps >= STUCK
@@ -138,6 +152,7 @@ impl Default for StepStats {
             non_finite: 0,
             non_finite_steps: 0,
             restarts: 0,
+            pose_motion: None,
         }
     }
 }

@@ -9,7 +9,7 @@ use crate::dataset::batch::Batch;
 use crate::dataset::{Dataset, SceneType};
 use crate::imaging::metrics::psnr_from_mse;
 use crate::model::config::Config;
-use crate::model::{Model, SceneBox, densities};
+use crate::model::{Model, POSES, SceneBox, densities};
 use crate::random::{Jitter, stream};
 use crate::sampling::{BatchSize, Progress};
 use crate::{Error, Result};
@@ -23,6 +23,10 @@ use std::time::{Duration, Instant};
 const RAYS: [usize; 2] = [256, 1 << 16];
 /// Steps between releases of unused memory: the number of samples changes during training.
 const TRIM_EVERY: u64 = 256;
+/// The fewest steps of a model after which poses are checked: they begin at 0 and need time to move.
+const CHECKED_STEPS: u64 = 100;
+/// The factor of the poses' learning rate once the given poses are right.
+const RIGHT_LR_SCALE: f64 = 0.02;
 
 /// Trains a model on a dataset: [`run`](Self::run) for a budget, or [`step`](Self::step) by step.
 ///
@@ -148,8 +152,10 @@ impl Trainer {
     /// Lets the sampler prepare from the images; the time counts as training.
     fn prepare(&mut self) {
         let start = (self.clock)();
-        // Not with camera refinement: carved space never comes back.
-        if self.model.camera_optimizer.is_none() {
+        // Carved space never comes back, so cameras must be right.
+        let camera = self.model.config.camera_optimizer;
+        let only_poses = camera.focal.is_none() && camera.lens.is_none();
+        if self.model.camera_optimizer.is_none() || (only_poses && self.done.given_poses_are_right()) {
             self.model.sampler.prepare(&self.data);
         }
         self.count_occupied();
@@ -195,9 +201,11 @@ impl Trainer {
 
     /// Performs one training step; `fraction` of the run (0 to 1) sets the schedules.
     pub fn step(&mut self, fraction: f64) -> StepStats {
+        self.check_poses(fraction);
         let start = (self.clock)();
         if self.model.config.camera_optimizer.coarse > 0.0 {
-            self.model.set_detail(self.model.config.camera_optimizer.detail(fraction));
+            let detail = self.model.config.camera_optimizer.detail(fraction);
+            self.model.set_detail(if self.done.given_poses_are_right() { 1.0 } else { detail });
         }
         // After a restart, steps of the new model count.
         self.update_sampler(&Progress { step: self.groups.steps() + 1, train_frac: fraction, seed: self.seed() });
@@ -237,12 +245,34 @@ impl Trainer {
                 0
             },
             restarts: self.done.restarts,
+            pose_motion: self.done.pose_motion,
         };
         self.adapt_batch(&work);
         if startup::has_collapsed(self.groups.steps(), self.done.opacity, self.collapses) {
             self.restart();
         }
         self.done
+    }
+
+    /// Checks the poses, once in a run. If refinement hardly moved them, the given ones are right. Training then
+    /// continues from them as with fixed cameras, except for a low learning rate of the poses.
+    fn check_poses(&mut self, fraction: f64) {
+        let check_at = self.model.config.camera_optimizer.check_at;
+        // The steps are those of the model, as a restart begins with the given poses.
+        let is_due = check_at > 0.0 && fraction >= check_at && self.groups.steps() >= CHECKED_STEPS;
+        let Some(optimizer) = self.model.camera_optimizer.as_ref().filter(|_| is_due) else { return };
+        if self.done.pose_motion.is_some() {
+            return;
+        }
+        self.done.pose_motion = optimizer.pose_motion(&self.model.params);
+        if self.done.given_poses_are_right() {
+            optimizer.reset_poses(&mut self.model.params);
+            if let Some(poses) = self.model.params.find(POSES) {
+                let scale = RIGHT_LR_SCALE * self.model.params.lr_scale(poses);
+                self.model.params.set_lr_scale(|name| name == POSES, scale);
+            }
+            self.prepare();
+        }
     }
 
     /// The seed of the current model: a restart draws other rays too.

@@ -227,6 +227,22 @@ impl CameraOptimizer {
         (RayVars { origins, directions }, moved)
     }
 
+    /// Returns how far the pose corrections move the images: the root mean square over images and their points, in
+    /// degrees. `None` if poses are not learned.
+    pub fn pose_motion<T: Scalar>(&self, params: &Params<T>) -> Option<f64> {
+        // In preconditioned parameters, the squared length of a row is an image's mean squared motion.
+        let sum: f64 = params.get(self.poses?).as_slice().iter().map(|x| x.to_f64().powi(2)).sum();
+        Some((sum / self.balance.len() as f64).sqrt().to_degrees())
+    }
+
+    /// Restores the given poses.
+    pub(crate) fn reset_poses<T: Scalar>(&self, params: &mut Params<T>) {
+        if let Some(poses) = self.poses {
+            let value = params.get_mut(poses);
+            *value = Tensor::zeros(value.shape());
+        }
+    }
+
     /// The centre of the scene box.
     fn middle(&self) -> DVec3 {
         0.5 * (self.extent.bounds[0] + self.extent.bounds[1])

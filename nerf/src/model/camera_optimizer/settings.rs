@@ -29,6 +29,10 @@ pub struct CameraOptimizerConfig {
     /// Fine detail too early pulls a pose to the nearest repetition of a pattern. 0 shows all detail from the
     /// start. Range: 0 to 1.
     pub coarse: f64,
+    /// Share of the run after which the trainer checks the poses. If they moved the images by less than .45 degrees,
+    /// the given poses are right: they are restored, all detail is enabled, and their learning rate falls to a
+    /// fiftieth. 0 omits the check. Range: 0 to 1.
+    pub check_at: f64,
 }
 
 impl CameraOptimizerConfig {
@@ -43,6 +47,7 @@ impl CameraOptimizerConfig {
     /// If a value is out of range.
     pub fn check(&self) -> Result<()> {
         check_range("camera_optimizer.coarse", self.coarse, 0.0, 1.0)?;
+        check_range("camera_optimizer.check_at", self.check_at, 0.0, 1.0)?;
         check_schedule("camera_optimizer.focal", self.focal)?;
         check_schedule("camera_optimizer.lens", self.lens)
     }

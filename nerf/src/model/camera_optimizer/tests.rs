@@ -42,7 +42,7 @@ fn cameras() -> Vec<Camera> {
 
 fn all() -> CameraOptimizerConfig {
     let rate = Some(Schedule::Constant { lr: 1e-3 });
-    CameraOptimizerConfig { focal: rate, lens: rate, coarse: 0.0 }
+    CameraOptimizerConfig { focal: rate, lens: rate, ..CameraOptimizerConfig::default() }
 }
 
 const FRAMES: [u32; 8] = [0, 1, 1, 2, 3, 4, 5, 2];
@@ -170,6 +170,32 @@ fn images_have_their_own_balance() {
             assert!((0.1..3.0).contains(&mean), "{k}: {mean}");
         }
     }
+}
+
+#[test]
+fn pose_motion_is_that_of_the_images() {
+    let cameras = cameras();
+    let mut params = Params::<f64>::new();
+    let config = CameraOptimizerConfig::default();
+    let new = |poses, params: &mut Params<f64>| {
+        CameraOptimizer::new(poses, &config, (&extent(6), false), &cameras, params).unwrap()
+    };
+    let refine = new(true, &mut params).unwrap();
+    assert_eq!(refine.pose_motion(&params), Some(0.0));
+    // A third of a degree about an axis across the view moves all points by about as much.
+    let camera = &cameras[4];
+    let axis = camera.pose.matrix3.x_axis * (1.0_f64 / 3.0).to_radians();
+    let row = numbers(&refine, 4, [axis.x, axis.y, axis.z, 0.0, 0.0, 0.0]);
+    let id = params.find(POSES).unwrap();
+    params.get_mut(id).as_mut_slice()[4 * POSE..5 * POSE].copy_from_slice(&row);
+    // One of six images moves.
+    let motion = refine.pose_motion(&params).unwrap() * 6.0_f64.sqrt();
+    assert!((0.9..1.1).contains(&(3.0 * motion)), "{motion}");
+    refine.reset_poses(&mut params);
+    assert!(refine.pose_motion(&params) == Some(0.0) && refine.camera(&params, 4, camera) == *camera);
+    let params = &mut Params::<f64>::new();
+    let refine = CameraOptimizer::new(false, &all(), (&extent(5), false), &cameras[..5], params).unwrap().unwrap();
+    assert_eq!(refine.pose_motion(params), None);
 }
 
 #[test]

@@ -165,6 +165,103 @@ fn restart_resets_refined_cameras() {
     assert!(trainer.stats().step == before + 3 && moved(&trainer));
 }
 
+/// A trainer that refines these parameters and has taken `steps` steps, and whose poses have then moved each image by
+/// this angle in degrees.
+fn refining(parts: &[RefinedParam], steps: u64, motion: f64) -> Trainer {
+    let mut config = tiny_table().with_refined(parts);
+    config.sampler.get_mut::<MarchingConfig>().unwrap().samples = 512;
+    let mut trainer = Trainer::new(config, Arc::new(ball(Split::Train, 32))).unwrap();
+    (0..steps).for_each(|_| _ = trainer.step(0.01));
+    let poses = trainer.model.params.find(POSES).unwrap();
+    let each = (motion.to_radians() / 6.0_f64.sqrt()) as f32;
+    trainer.model.params.get_mut(poses).as_mut_slice().fill(each);
+    trainer
+}
+
+/// Whether the trainer treats the given poses as right: all detail, and a low learning rate of the poses.
+fn keeps_given_poses(trainer: &Trainer) -> bool {
+    let params = &trainer.model.params;
+    let poses = params.find(POSES).unwrap();
+    let signs = [trainer.model.detail() == 1.0, params.lr_scale(poses) < 0.1];
+    assert_eq!(signs[0], signs[1]);
+    signs[0]
+}
+
+#[test]
+fn poses_that_hardly_move_are_restored() {
+    for (motion, right) in [(0.4, true), (0.6, false)] {
+        let mut trainer = refining(&[RefinedParam::Poses], 100, motion);
+        // Too early in the run.
+        trainer.step(0.04);
+        assert!(!keeps_given_poses(&trainer) && trainer.stats().pose_motion.is_none());
+        let poses = trainer.model.params.find(POSES).unwrap();
+        trainer.model.params.set_lr_scale(|name| name == POSES, 0.5);
+        let found = trainer.step(0.05).pose_motion.unwrap();
+        assert!((found - motion).abs() < 0.05, "{found} {motion}");
+        let scale = trainer.model.params.lr_scale(poses);
+        assert!((scale - if right { 0.01 } else { 0.5 }).abs() < 1e-12, "{scale}");
+        let left = trainer.model.camera_optimizer.as_ref().unwrap().pose_motion(&trainer.model.params).unwrap();
+        assert!((left < 0.01) == right && (left > 0.5) != right, "{left}");
+        assert_eq!((keeps_given_poses(&trainer), trainer.stats().given_poses_are_right()), (right, right));
+        // The first check counts, also after a restart.
+        trainer.model.params.get_mut(poses).as_mut_slice().fill(if right { 0.1 } else { 0.0 });
+        assert_eq!(trainer.step(0.06).pose_motion, Some(found));
+        trainer.restart();
+        trainer.step(0.07);
+        assert_eq!((keeps_given_poses(&trainer), trainer.stats().pose_motion), (right, Some(found)));
+    }
+}
+
+#[test]
+fn poses_are_checked_after_steps_of_the_model() {
+    let mut trainer = refining(&[RefinedParam::Poses], 98, 0.0);
+    assert_eq!(trainer.step(0.5).pose_motion, None);
+    trainer.restart();
+    let mut checked = |steps: u64| (0..steps).filter(|_| trainer.step(0.5).pose_motion.is_some()).count();
+    assert_eq!([checked(100), checked(1)], [0, 1]);
+    let mut trainer = refining(&[RefinedParam::Focal, RefinedParam::Poses], 100, 0.0);
+    trainer.model.config.camera_optimizer.check_at = 0.0;
+    assert_eq!(trainer.step(0.5).pose_motion, None);
+}
+
+#[test]
+fn right_poses_carve_unless_lenses_are_refined() {
+    use RefinedParam::{Focal, Lens, Poses};
+    let carved = Trainer::new(tiny_table(), Arc::new(ball(Split::Train, 32))).unwrap().stats().occupied;
+    assert!((0.05..0.95).contains(&carved), "{carved}");
+    for (parts, motion, carves) in
+        [(&[Poses][..], 0.1, true), (&[Poses], 0.6, false), (&[Poses, Focal], 0.1, false), (&[Poses, Lens], 0.1, false)]
+    {
+        let mut trainer = refining(parts, 100, motion);
+        let before = trainer.stats().occupied;
+        trainer.check_poses(0.2);
+        assert!(trainer.stats().pose_motion.is_some_and(|found| (found - motion).abs() < 0.01), "{parts:?}");
+        assert_eq!(trainer.stats().occupied, if carves { carved } else { before }, "{parts:?} {motion}");
+    }
+}
+
+#[test]
+fn run_resumes_before_and_after_the_check_of_poses() {
+    for motion in [0.4, 0.6] {
+        let mut trainer = refining(&[RefinedParam::Poses], 100, motion);
+        let fractions = [0.04, 0.05, 0.06];
+        for i in 0..3 {
+            let state = trainer.state().unwrap();
+            let (config, data) = (trainer.model.config.clone(), trainer.data.clone());
+            let mut later = Trainer::new(config, data).unwrap();
+            later.load_state(&state).unwrap();
+            fractions[i..].iter().for_each(|fraction| _ = later.step(*fraction));
+            trainer.step(fractions[i]);
+            let mut rest = Trainer::new(trainer.model.config.clone(), trainer.data.clone()).unwrap();
+            rest.load_state(&trainer.state().unwrap()).unwrap();
+            fractions[i + 1..].iter().for_each(|fraction| _ = rest.step(*fraction));
+            assert_eq!(later.model.params.values(), rest.model.params.values(), "{motion} {i}");
+            assert_eq!(later.stats().pose_motion, rest.stats().pose_motion);
+            assert!(later.stats().pose_motion.is_some() && keeps_given_poses(&later) == (motion < 0.45));
+        }
+    }
+}
+
 /// Two tiny networks, with few rays of few samples.
 fn tiny() -> Config {
     let paper = ClassicConfig::paper();
