@@ -159,9 +159,10 @@ impl Opened {
         inside(&self.capture.as_ref()?.0)
     }
 
-    /// The factor that brings images to a size that trains well; 1 for built-in scenes.
-    pub fn automatic_downscale(&self) -> usize {
-        self.capture.as_ref().map_or(1, |(capture, _)| capture.automatic_downscale())
+    /// The factor that brings images to a size that suits a grid with this many `cells` along the scene box; 1 for
+    /// built-in scenes.
+    pub fn automatic_downscale(&self, cells: f64) -> usize {
+        self.capture.as_ref().map_or(1, |(capture, analysis)| capture.automatic_downscale(analysis, cells))
     }
 
     /// Loads at most `views` evenly spaced images of a split at `1 / downscale` of their size. Warns of absent images.

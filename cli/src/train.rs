@@ -114,7 +114,8 @@ pub struct Args {
     /// Divide the image size by K [default: automatic]
     ///
     /// A training pixel is the mean of the image pixels that it covers. The default brings the longest side to 1600
-    /// pixels or less; 1 keeps the size. Range: 1 to 16384.
+    /// pixels or less, and all training images to 3 GB or less. It also avoids pixels of less than half of the finest
+    /// cells that the budget allows. 1 keeps the size. Range: 1 to 16384.
     #[arg(long, help_heading = "Scene", value_name = "K", value_parser = parse::count(1 << 14))]
     downscale: Option<usize>,
     /// Test images: none, every:N, or names
@@ -273,7 +274,10 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     };
     let description = args.format.map_or(Ok(None), |format| source.description(format))?;
     let mut scene = source.open(args.scene_type, args.mask_as_alpha, args.test.as_ref(), description.as_deref())?;
-    let downscale = args.downscale.unwrap_or_else(|| scene.automatic_downscale());
+    let downscale = match args.downscale {
+        Some(factor) => factor,
+        None => scene.automatic_downscale(args.most_cells()?),
+    };
     scene.depth = args.has_depth_loss();
     let mut data = scene.load(Split::Train, downscale, usize::MAX)?;
     if let Some(near) = args.near {

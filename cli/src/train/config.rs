@@ -6,7 +6,7 @@ use raygrad::nerf::dataset::Dataset;
 use raygrad::nerf::losses::DepthConfig;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
-use raygrad::nerf::{Background, Budget, Config, Error, LossTermConfig, Preset, Result, Trainer};
+use raygrad::nerf::{Background, Budget, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
 use serde_json::Value;
 
 use super::super::cameras::Viewpoint;
@@ -59,6 +59,14 @@ impl Args {
             return Err(Error::setting("preset", what));
         }
         Ok(config)
+    }
+
+    /// The most cells along the scene box that a hash grid may have with the budget; infinite for other fields.
+    pub fn most_cells(&self) -> Result<f64> {
+        let config = Config::preset(self.preset).for_budget(self.budget().samples(), f64::INFINITY);
+        let set = self.set.iter().filter(|(name, _)| name.starts_with("field"));
+        let config = set.into_iter().try_fold(config, |config, (name, value)| changed(&config, name, value))?;
+        Ok(config.field.get::<InstantConfig>().map_or(f64::INFINITY, |field| field.grid.finest as f64))
     }
 
     /// True if a depth loss is added, which needs measured depths.
@@ -177,6 +185,15 @@ mod tests {
         assert_eq!(weight(""), 0.1);
         assert_eq!(weight(r#"--set sampler={"kind":"proposal"}"#), 0.002);
         assert_eq!(weight(r#"--loss distortion=0.5 --set sampler={"kind":"proposal"}"#), 0.5);
+    }
+
+    #[test]
+    fn most_cells_follow_budget_and_flags() {
+        let cells = |flags: &str| Args::parse_from(format!("train {flags}").split_whitespace()).most_cells().unwrap();
+        assert_eq!(cells("--steps 1000"), 512.0);
+        assert_eq!(cells("--steps 30000"), 768.0);
+        assert_eq!(cells("--steps 1000 --set field.grid.finest=2048"), 2048.0);
+        assert_eq!(cells("--preset voxel"), f64::INFINITY);
     }
 
     #[test]

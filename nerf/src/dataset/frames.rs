@@ -122,21 +122,8 @@ impl Dataset {
     /// A camera inside the box counts as if it stood at its side. For a forward-facing scene it counts the pixels
     /// across the [NDC frustum](Self::ndc) at that depth.
     pub fn pixels_per_side(&self) -> f64 {
-        let [lower, upper] = self.bounds;
-        let (middle, side) = (0.5 * (lower + upper), (upper - lower).max_element());
-        let each = self.frames.iter().map(|Frame { camera, .. }| {
-            if let Some(ndc) = self.ndc.filter(|_| self.scene_type == SceneType::ForwardFacing) {
-                return ndc.pixels(camera, middle);
-            }
-            let distance = camera.pose.translation.distance(middle).max(0.5 * side);
-            // The pixels per radian of a panorama.
-            let focal = match camera.lens {
-                Lens::Equirectangular => camera.width as f64 / std::f64::consts::TAU,
-                _ => camera.focal[0].max(camera.focal[1]),
-            };
-            side * focal / distance
-        });
-        median(each)
+        let ndc = self.ndc.filter(|_| self.scene_type == SceneType::ForwardFacing);
+        median(self.frames.iter().map(|frame| pixels_across(&frame.camera, self.bounds, ndc)))
     }
 
     /// Returns whether an image has an alpha channel and so needs a [background](crate::dataset::background).
@@ -205,6 +192,22 @@ impl Dataset {
         );
         Err(Error::setting("dataset", what))
     }
+}
+
+/// The pixels of a camera along the longest side of the box `bounds`, at its centre, or across the NDC frustum there.
+pub(super) fn pixels_across(camera: &Camera, bounds: [DVec3; 2], ndc: Option<Ndc>) -> f64 {
+    let [lower, upper] = bounds;
+    let (middle, side) = (0.5 * (lower + upper), (upper - lower).max_element());
+    if let Some(ndc) = ndc {
+        return ndc.pixels(camera, middle);
+    }
+    let distance = camera.pose.translation.distance(middle).max(0.5 * side);
+    // The pixels per radian of a panorama.
+    let focal = match camera.lens {
+        Lens::Equirectangular => camera.width as f64 / std::f64::consts::TAU,
+        _ => camera.focal[0].max(camera.focal[1]),
+    };
+    side * focal / distance
 }
 
 /// Returns at most `count` of the items, in order and evenly spaced: of `n` items those with index `i n / count`,

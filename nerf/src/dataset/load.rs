@@ -14,7 +14,6 @@ use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use crate::memory::{available_memory, gigabytes};
-use crate::numbers::median;
 use glam::DAffine3;
 use raygrad_tensor::parallel::{self, locked};
 use std::collections::HashMap;
@@ -30,10 +29,6 @@ const LOOKED_AT: usize = 3;
 const CLEAR: f64 = 0.05;
 /// The white share of the border from which an image shows an object in front of white.
 const WHITE_BORDER: f64 = 0.98;
-/// The longest side of an image, and of a panorama, after automatic downscaling; and the number of images that decide.
-const MOST_AUTOMATIC: f64 = 1600.0;
-const MOST_OF_PANORAMA: f64 = 6400.0;
-const MEASURED: usize = 25;
 /// The largest downscale factor that is suggested.
 const MOST_DOWNSCALE: u64 = 1 << 14;
 /// The least mask value of a used pixel.
@@ -226,18 +221,6 @@ impl Capture {
             _ => None,
         };
         SceneAnalysis::new(self, empty, asked)
-    }
-
-    /// Returns the downscale factor that brings the longest side of most images to 1600 pixels or less, as nerfstudio's
-    /// does, or that of panoramas to 6400. It is 1 for images whose headers cannot be read.
-    pub fn automatic_downscale(&self) -> usize {
-        let side = |view: &View| {
-            let [width, height] = Photo::size_of_file(view.image.as_ref()?).ok()?[0];
-            let most = if view.camera.lens == Lens::Equirectangular { MOST_OF_PANORAMA } else { MOST_AUTOMATIC };
-            Some(width.max(height) as f64 / most)
-        };
-        let factors = evenly_spaced(self.present().collect(), MEASURED).into_iter().filter_map(side);
-        (median(factors).ceil() as usize).max(1)
     }
 
     /// [Analyses](Self::analyze_scene) a scene whose masks [cut out an object](LoadOptions::mask_as_alpha): the
@@ -444,7 +427,8 @@ pub(super) fn size_for(path: &Path, camera: &Camera) -> Result<[usize; 2]> {
     fitting(&Header::read(path)?, path, camera)
 }
 
-fn fitting(header: &Header, path: &Path, camera: &Camera) -> Result<[usize; 2]> {
+/// The size of an image in the orientation of its camera, from its header.
+pub(super) fn fitting(header: &Header, path: &Path, camera: &Camera) -> Result<[usize; 2]> {
     header.sizes.into_iter().find(|size| same_shape(*size, camera)).ok_or_else(|| {
         let (Camera { width, height, .. }, [w, h]) = (camera, header.sizes[0]);
         let what = format!("has {w}x{h} pixels but its camera {width}x{height}; use one aspect ratio");

@@ -9,6 +9,7 @@ pub(crate) mod batch;
 pub mod capture;
 pub(crate) mod color_space;
 mod depth;
+mod downscale;
 pub mod formats;
 mod frames;
 mod hold_out;

@@ -454,25 +454,3 @@ fn transparent_pixels_of_a_mask_are_black_at_each_size() {
         assert!(!mask.uses(side / 2, 0) && mask.uses(side / 2, side - 1), "{side}");
     }
 }
-
-#[test]
-fn automatic_downscale_limits_the_longest_side() {
-    let folder = tempfile::tempdir().unwrap();
-    let factor = |sizes: &[[usize; 2]], lens: Lens| {
-        let mut capture = capture(folder.path(), sizes.len() + 3);
-        for (view, size) in capture.views.iter_mut().filter(|view| view.field != "frames[2]").zip(sizes) {
-            Image::new(size[0], size[1], 1).save_png(view.image.as_ref().unwrap()).unwrap();
-            view.camera.lens = lens;
-        }
-        capture.views.truncate(sizes.len());
-        capture.automatic_downscale()
-    };
-    for (size, expected) in [([1600, 2], 1), ([2, 1601], 2), ([4032, 3], 3), ([3, 4801], 4), ([8, 8], 1)] {
-        assert_eq!(factor(&[size], Lens::Pinhole), expected, "{size:?}");
-    }
-    assert_eq!(factor(&[[6400, 2]], Lens::Equirectangular), 1);
-    assert_eq!(factor(&[[8192, 2]], Lens::Equirectangular), 2);
-    // A single large image does not count.
-    assert_eq!(factor(&[[5000, 1], [1600, 1], [1600, 1]], Lens::Pinhole), 1);
-    assert_eq!(Capture::new(folder.path(), "t.json".into(), Format::Transforms, vec![]).automatic_downscale(), 1);
-}
