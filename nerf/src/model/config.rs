@@ -21,17 +21,8 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// Cascades of an unbounded scene; each is twice as large as the one before.
-const CASCADES: usize = 6;
-/// Cells along each axis of a cascade.
-const RESOLUTION: usize = 32;
-/// Step lengths in an unbounded scene, in training and in renders, as shares of the box's side.
-const STEP: f64 = 1.0 / 100.0;
-const VIEW_STEP: f64 = 1.0 / 150.0;
 /// The factor of the samples per step in unbounded scenes: most of them are behind opaque parts and cost little.
 const SAMPLES: usize = 4;
-/// Growth of the steps per unit of distance.
-const CONE: f64 = 1.0 / 64.0;
 /// Weight of the distortion loss in unbounded scenes, where few images show each point.
 const DISTORTION: f64 = 0.1;
 /// The same with proposals, as in nerfacto. With the weight above they collapse onto floaters.
@@ -269,9 +260,9 @@ impl Config {
 
     /// Adapts the configuration to the type of scene; a second call with the same type changes nothing.
     ///
-    /// For an unbounded scene it marches through cascades with growing steps.
-    /// It doubles the resolution of a hash grid and adds a [distortion loss](DistortionConfig) against fog. It
-    /// overrides the steps of [`for_budget`](Self::for_budget). Figures are in docs/benchmarks/results.md, section
+    /// For an unbounded scene a marching sampler goes through [cascades](MarchingConfig::cascaded) with growing steps. It
+    /// doubles the resolution of a hash grid and adds a [distortion loss](DistortionConfig) against fog. The
+    /// steps along a ray shorten during training where those of [`for_budget`](Self::for_budget) do. Figures are in docs/benchmarks/results.md, section
     /// Captures.
     pub fn with_scene_type(mut self, scene_type: SceneType) -> Self {
         let before = std::mem::replace(&mut self.unbounded, scene_type.is_unbounded());
@@ -280,12 +271,11 @@ impl Config {
         }
         let usual = MarchingConfig::default();
         if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
-            let occupancy = &mut marching.occupancy;
             if self.unbounded {
-                (occupancy.cascades, occupancy.resolution) = (CASCADES, RESOLUTION);
-                (marching.step, marching.last_step, marching.cone) = (STEP, None, CONE);
-                (marching.view_step, marching.samples) = (VIEW_STEP, SAMPLES * marching.samples.min(usual.samples));
+                let samples = SAMPLES * marching.samples.min(usual.samples);
+                *marching = MarchingConfig { samples, ..marching.clone().cascaded() };
             } else {
+                let occupancy = &mut marching.occupancy;
                 (occupancy.cascades, occupancy.resolution) = (1, usual.occupancy.resolution);
                 *marching =
                     MarchingConfig { occupancy: marching.occupancy, samples: marching.samples / SAMPLES, ..usual };
@@ -554,6 +544,7 @@ mod tests {
         assert_eq!((samples(&skipped), samples(&open)), (16 * 256, 4 * 16 * 256));
         assert_eq!(open.with_scene_type(SceneType::Bounded), skipped);
         let long = Config::preset(Preset::Instant).for_budget(1.2e9, 400.0).with_scene_type(SceneType::Unbounded);
-        assert_eq!(long.sampler.get::<MarchingConfig>().unwrap().last_step, None);
+        let MarchingConfig { step, last_step, cone, view_step, .. } = *long.sampler.get::<MarchingConfig>().unwrap();
+        assert_eq!((step, last_step, cone, view_step), (0.01, Some(0.004), 0.01, 0.005));
     }
 }

@@ -20,6 +20,20 @@ use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::Arc;
 
+/// Cascades of an unbounded scene; each is twice as large as the one before.
+const CASCADES: usize = 6;
+/// Cells along each axis of a cascade.
+const CASCADE_RESOLUTION: usize = 32;
+/// Step lengths in an unbounded scene, in training and in renders, as shares of the box's side.
+const CASCADE_STEP: f64 = 1.0 / 100.0;
+const CASCADE_VIEW_STEP: f64 = 1.0 / 150.0;
+/// Growth of the steps per unit of distance.
+const CASCADE_CONE: f64 = 1.0 / 64.0;
+/// The same values of a long training, whose steps shorten to the last one.
+const LONG_LAST_STEP: f64 = 1.0 / 250.0;
+const LONG_VIEW_STEP: f64 = 1.0 / 200.0;
+const LONG_CONE: f64 = 1.0 / 100.0;
+
 /// Configuration of a [`Marching`] sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -36,8 +50,8 @@ pub struct MarchingConfig {
     /// side of the scene box. Range: 0.00001 to 1.
     pub view_step: f64,
     /// Growth of the interval with distance from the camera, a number without unit: at distance t an interval is
-    /// `step + cone t` long. 0 keeps intervals even. Unbounded scenes use 1/64, coarser than the 1/256 of
-    /// instant-ngp. Renders scale it by `view_step / step`. See [`Step::cone`]. Range: 0 to 1.
+    /// `step + cone t` long. 0 keeps intervals even. [Cascades](Self::cascaded) use 1/64, or 1/100 in a long
+    /// training, for the 1/256 of instant-ngp. Renders scale it by `view_step / step`. See [`Step::cone`]. Range: 0 to 1.
     pub cone: f64,
     /// Samples in a training step. The number of rays follows from it. Range: 1 to 16777216.
     pub samples: usize,
@@ -63,6 +77,20 @@ impl Default for MarchingConfig {
             early_stop_eps: 1e-3,
             quadrature: Quadrature::Midpoint,
         }
+    }
+}
+
+impl MarchingConfig {
+    /// Returns the configuration for an unbounded scene: cascades of boxes, and steps that grow with the distance. If
+    /// steps shorten during training, they do so here, to a finer last step. The other values stay.
+    pub fn cascaded(mut self) -> Self {
+        (self.occupancy.cascades, self.occupancy.resolution) = (CASCADES, CASCADE_RESOLUTION);
+        self.step = CASCADE_STEP;
+        (self.last_step, self.cone, self.view_step) = match self.last_step {
+            Some(_) => (Some(LONG_LAST_STEP), LONG_CONE, LONG_VIEW_STEP),
+            None => (None, CASCADE_CONE, CASCADE_VIEW_STEP),
+        };
+        self
     }
 }
 

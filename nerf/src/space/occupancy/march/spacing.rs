@@ -23,7 +23,7 @@ pub struct Step {
     /// Step length in scene units, above 0. If it is below an ULP of the distance, samples coincide.
     pub length: f32,
     /// Growth of the step with distance, without unit, 0 to 1; 0 is uniform. The angle of a pixel in radians makes
-    /// steps grow with the pixel's footprint. instant-ngp uses 1/256 for large scenes; the presets use 1/64 for
+    /// steps grow with the pixel's footprint. instant-ngp uses 1/256 for large scenes; the presets use 1/64 or 1/100 for
     /// unbounded ones.
     pub cone: f32,
     /// Maximum number of samples per ray.
