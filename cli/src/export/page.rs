@@ -6,9 +6,12 @@ use std::path::Path;
 
 use base64::prelude::{BASE64_STANDARD, Engine};
 use half::f16;
+use raygrad::nerf::component::ComponentConfig;
 use raygrad::nerf::encoding::hash_grid::HashGrid;
 use raygrad::nerf::field::{Instant, InstantConfig, log_density_shift};
 use raygrad::nerf::sampling::marching::{Marching, MarchingConfig};
+use raygrad::nerf::sampling::proposal::ProposalConfig;
+use raygrad::nerf::space::occupancy::OccupancyGrid;
 use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::nerf::{Error, Model, Result, write_atomic};
 use serde_json::{Value, json};
@@ -27,10 +30,12 @@ const SHADER: &str = include_str!("page/scene.frag");
 /// Most features per table entry, and most width of a layer, that the shader supports.
 const MOST_FEATURES: usize = 16;
 const MOST_WIDTH: usize = 256;
+/// The factor of the steps of a page where proposals placed the samples: surfaces are thinner than marching makes them.
+const FINER: f64 = 0.5;
 
 /// Writes the page of a run.
 pub fn run(run: &Run, out: &Path, job: &Job) -> Result<()> {
-    let model = run.model()?;
+    let model = marched(run.model()?)?;
     let page = page(run, &model, job.mark()).map_err(|what| Error::file(out, what))?;
     job.check(out)?;
     write_atomic(out, page.as_bytes())?;
@@ -38,11 +43,27 @@ pub fn run(run: &Run, out: &Path, job: &Job) -> Result<()> {
     print(&format!("exported a scene page of {megabytes:.1} MB: {}\n", out.display()))
 }
 
+/// The model with samples by marching, as the shader takes them. Proposals become steps through the cells that the
+/// field occupies.
+fn marched(mut model: Model<f32>) -> Result<Model<f32>> {
+    if model.config.sampler.kind() == ProposalConfig::KIND {
+        let mut config = MarchingConfig::default();
+        if model.config.unbounded {
+            config = config.cascaded();
+        }
+        config.view_step *= FINER;
+        let grid = OccupancyGrid::new(model.space().bounds, &config.occupancy)?;
+        model.sampler = Box::new(Marching::new(config, grid));
+        model.finish();
+    }
+    Ok(model)
+}
+
 /// Checks that a page can show the model; returns the reason if not.
 fn check(model: &Model<f32>) -> std::result::Result<(&InstantConfig, &Marching), String> {
     let (Some(config), Some(marching)) = (model.config.field.get::<InstantConfig>(), model.marching()) else {
         return Err(format!(
-            "a scene page needs the field `instant` and the sampler `marching`; the run has `{}` and `{}`",
+            "a scene page needs the field `instant` and the sampler `marching` or `proposal`; the run has `{}` and `{}`",
             model.config.field.kind(),
             model.config.sampler.kind()
         ));
@@ -222,9 +243,11 @@ fn weights(model: &Model<f32>, config: &InstantConfig) -> std::result::Result<Ve
 
 #[cfg(test)]
 mod tests {
+    use raygrad::nerf::dataset::SceneType;
     use raygrad::nerf::encoding::hash_grid::HashGridConfig;
     use raygrad::nerf::glam::{DMat3, DVec3};
-    use raygrad::nerf::{Config, FieldConfig, Ndc, Preset, SamplerConfig, SceneBox};
+    use raygrad::nerf::imaging::metrics::psnr;
+    use raygrad::nerf::{Camera, Config, FieldConfig, Ndc, Preset, SamplerConfig, SceneBox};
 
     use super::*;
 
@@ -258,6 +281,28 @@ mod tests {
     fn give(model: &mut Model<f32>, name: &str, values: &[f32]) {
         let id = model.params.find(name).unwrap();
         model.params.get_mut(id).as_mut_slice().copy_from_slice(values);
+    }
+
+    /// Steps through the cells show what proposals show, in a fog.
+    #[test]
+    fn proposals_become_steps() {
+        let unbounded = |config: &mut Config, _: &mut SceneBox| {
+            config.sampler = SamplerConfig::new(ProposalConfig::default());
+            *config = config.clone().with_scene_type(SceneType::Unbounded);
+        };
+        let model = model(small(), unbounded);
+        let pose = Camera::look_at(DVec3::new(0.9, 1.0, 0.2), DVec3::Y, DVec3::Z);
+        let camera = Camera::from_angle(16, 12, 0.8, pose);
+        let by_proposals = model.render(&camera, [1.0; 3]).color;
+        let error = check(&model).err().unwrap();
+        assert!(error.contains("`marching` or `proposal`"), "{error}");
+        let stepped = marched(model).unwrap();
+        assert!(check(&stepped).is_ok());
+        let by_steps = stepped.render(&camera, [1.0; 3]).color;
+        let alike = psnr(&by_steps, &by_proposals);
+        assert!(alike > 30.0 && by_steps != by_proposals, "{alike} dB");
+        let darkest = by_steps.data.iter().copied().fold(1.0, f32::min);
+        assert!(darkest < 0.9, "the fog is visible: {darkest}");
     }
 
     #[test]

@@ -218,8 +218,10 @@ impl Proposal {
             u.iter_mut().enumerate().for_each(|(i, u)| *u = (i as f64 + shift) / bins as f64);
             // Bad weights count as 0 here; the colours show them.
             let temper = |weight: &T| match weight.to_f64() {
-                weight if weight.is_finite() && weight > 0.0 => weight.powf(self.trust),
-                _ => 0.0,
+                weight if !(weight.is_finite() && weight > 0.0) => 0.0,
+                // Exact, as a power is not needed from the end of annealing on.
+                weight if self.trust == 1.0 => weight,
+                weight => weight.powf(self.trust),
             };
             tempered.iter_mut().zip(weights).for_each(|(out, weight)| *out = temper(weight));
             if invert_cdf(shares, &tempered, self.config.uniform_share, &u, &mut places).is_err() {
