@@ -159,10 +159,11 @@ impl Opened {
         inside(&self.capture.as_ref()?.0)
     }
 
-    /// The factor that brings images to a size that suits a grid with this many `cells` along the scene box; 1 for
-    /// built-in scenes.
-    pub fn automatic_downscale(&self, cells: f64) -> usize {
-        self.capture.as_ref().map_or(1, |(capture, analysis)| capture.automatic_downscale(analysis, cells))
+    /// The factor that brings images to a size that suits a grid with at most `cells` cells along a scene of this type; 1
+    /// for built-in scenes.
+    pub fn automatic_downscale(&self, cells: impl FnOnce(SceneType) -> Result<f64>) -> Result<usize> {
+        let Some((capture, analysis)) = &self.capture else { return Ok(1) };
+        Ok(capture.automatic_downscale(analysis, cells(analysis.scene_type)?))
     }
 
     /// Loads at most `views` evenly spaced images of a split at `1 / downscale` of their size. Warns of absent images.

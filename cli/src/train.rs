@@ -276,7 +276,7 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     let mut scene = source.open(args.scene_type, args.mask_as_alpha, args.test.as_ref(), description.as_deref())?;
     let downscale = match args.downscale {
         Some(factor) => factor,
-        None => scene.automatic_downscale(args.most_cells()?),
+        None => scene.automatic_downscale(|scene_type| args.most_cells(scene_type))?,
     };
     scene.depth = args.has_depth_loss();
     let mut data = scene.load(Split::Train, downscale, usize::MAX)?;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use raygrad::nerf::dataset::Dataset;
+use raygrad::nerf::dataset::{Dataset, SceneType};
 use raygrad::nerf::losses::DepthConfig;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
@@ -61,12 +61,16 @@ impl Args {
         Ok(config)
     }
 
-    /// The most cells along the scene box that a hash grid may have with the budget; infinite for other fields.
-    pub fn most_cells(&self) -> Result<f64> {
+    /// The most cells along the scene box, or across the NDC frustum, that a hash grid may have with the budget;
+    /// infinite for other fields.
+    pub fn most_cells(&self, scene_type: SceneType) -> Result<f64> {
         let config = Config::preset(self.preset).for_budget(self.budget().samples(), f64::INFINITY);
+        let config = config.with_scene_type(scene_type);
+        // Contraction leaves half of the cells along an axis to the box.
+        let share = if scene_type == SceneType::Unbounded { 0.5 } else { 1.0 };
         let set = self.set.iter().filter(|(name, _)| name.starts_with("field"));
         let config = set.into_iter().try_fold(config, |config, (name, value)| changed(&config, name, value))?;
-        Ok(config.field.get::<InstantConfig>().map_or(f64::INFINITY, |field| field.grid.finest as f64))
+        Ok(config.field.get::<InstantConfig>().map_or(f64::INFINITY, |field| share * field.grid.finest as f64))
     }
 
     /// True if a depth loss is added, which needs measured depths.
@@ -189,7 +193,13 @@ mod tests {
 
     #[test]
     fn most_cells_follow_budget_and_flags() {
-        let cells = |flags: &str| Args::parse_from(format!("train {flags}").split_whitespace()).most_cells().unwrap();
+        let of = |scene_type, flags: &str| {
+            Args::parse_from(format!("train {flags}").split_whitespace()).most_cells(scene_type).unwrap()
+        };
+        let cells = |flags: &str| of(SceneType::Bounded, flags);
+        assert_eq!(of(SceneType::Unbounded, "--steps 1000"), 512.0);
+        assert_eq!(of(SceneType::ForwardFacing, "--steps 1000"), 1024.0);
+        assert_eq!(of(SceneType::Unbounded, "--steps 1000 --set field.grid.finest=2048"), 1024.0);
         assert_eq!(cells("--steps 1000"), 512.0);
         assert_eq!(cells("--steps 30000"), 768.0);
         assert_eq!(cells("--steps 1000 --set field.grid.finest=2048"), 2048.0);

@@ -186,17 +186,18 @@ fn large_images_are_downscaled() {
     let train = |flags: &str, run: &str| {
         let said = said(&place, &format!("train large --steps 1 --out {run} {SMALL} {flags}"));
         (
-            said.contains("note: images are downscaled by 3, to 1068x3; --downscale 1 keeps their size"),
+            said.contains("note: images are downscaled by 8, to 401x1; --downscale 1 keeps their size"),
             place.json(&format!("{run}/config.json"))["downscale"].clone(),
         )
     };
-    assert_eq!(train("", "run"), (true, json!(3)));
+    // A grid of a short training resolves no more.
+    assert_eq!(train("", "run"), (true, json!(8)));
     assert_eq!(train("--downscale 1", "whole"), (false, json!(1)));
     place.succeeds("eval run");
-    assert_eq!(place.json("run/eval-test-fast.json")["downscale"], json!(3));
+    assert_eq!(place.json("run/eval-test-fast.json")["downscale"], json!(8));
     // Renders have the size of training.
     place.succeeds("render run --path test --out views");
-    assert_eq!(png(&place.path("views/0000.png")).width, 1068);
+    assert_eq!(png(&place.path("views/0000.png")).width, 401);
 }
 
 #[test]

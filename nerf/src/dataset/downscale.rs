@@ -12,6 +12,8 @@ use crate::numbers::median;
 /// The longest side of an image, and of a panorama, after automatic downscaling.
 const LONGEST: f64 = 1600.0;
 const LONGEST_OF_PANORAMA: f64 = 6400.0;
+/// The least share of these sides to which the cells of a grid bring an image.
+const LEAST_SHARE: f64 = 0.25;
 /// The most bytes of all training images after automatic downscaling.
 const MOST_BYTES: f64 = 3e9;
 /// The number of images whose headers decide.
@@ -49,8 +51,9 @@ impl Capture {
     /// cannot be read.
     ///
     /// The longest side is then at most 1600 pixels, as nerfstudio's, or 6400 of a panorama. All training images
-    /// together take at most 3 GB. And there is at most one pixel for each of the `cells` along the scene box, or less
-    /// than two: a grid with those cells does not resolve more.
+    /// together take at most 3 GB. And there are less than two pixels for each of the `cells` along the scene box, or
+    /// across the NDC frustum, as a grid with those cells does not resolve more; images that are larger than 400 pixels
+    /// (1600 for panoramas) stay so.
     pub fn automatic_downscale(&self, analysis: &SceneAnalysis, cells: f64) -> usize {
         let trained: Vec<&View> =
             self.split(Split::Train).into_iter().flatten().filter(|view| view.image.is_some()).collect();
@@ -64,8 +67,9 @@ impl Capture {
 fn factor(measured: &[Measured], count: usize, cells: f64) -> usize {
     let typical = |value: fn(&Measured) -> f64| median(measured.iter().map(value));
     let bytes = count as f64 * typical(|image| image.bytes);
-    let least = [typical(|image| image.side).ceil(), (bytes / MOST_BYTES).sqrt().ceil()];
-    least.into_iter().chain([(typical(|image| image.across) / cells).floor()]).fold(1.0, f64::max) as usize
+    let side = typical(|image| image.side);
+    let by_cells = (typical(|image| image.across) / cells).min(side / LEAST_SHARE).floor();
+    [side.ceil(), (bytes / MOST_BYTES).sqrt().ceil(), by_cells].into_iter().fold(1.0, f64::max) as usize
 }
 
 #[cfg(test)]
@@ -95,9 +99,10 @@ mod tests {
         }
         // Less than two pixels a cell stay.
         for (across, expected) in [(1023.0, 1), (1024.0, 2), (1600.0, 3)] {
-            assert_eq!(factor(&[Measured { across, ..FEW }], 1, 512.0), expected, "{across}");
+            assert_eq!(factor(&[Measured { across, side: 1.0, ..FEW }], 1, 512.0), expected, "{across}");
         }
         assert_eq!(made(|image| image.across = 1e5, 1, f64::INFINITY), 1, "a field without cells");
+        assert_eq!(made(|image| image.across = 1e5, 1, 512.0), 2, "800 pixels become 400 at least");
         assert_eq!(factor(&[], 5, 512.0), 1, "no header could be read");
         // A single large image does not count.
         assert_eq!(factor(&[Measured { side: 9.0, ..FEW }, FEW, FEW], 3, 512.0), 1);
