@@ -1,5 +1,6 @@
 //! The command line: the built program on small folders.
 
+use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -64,24 +65,29 @@ const SIZE: usize = 24;
 /// Files of a place that many tests start from.
 struct Kept {
     root: String,
-    files: Vec<(PathBuf, Vec<u8>)>,
+    files: BTreeMap<PathBuf, Vec<u8>>,
+}
+
+/// The files below a folder with their contents, by their paths below it.
+fn files_below(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let (mut folders, mut files) = (vec![root.to_owned()], BTreeMap::new());
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                files.insert(path.strip_prefix(root).unwrap().to_owned(), std::fs::read(&path).unwrap());
+            }
+        }
+    }
+    files
 }
 
 impl Kept {
     fn of(place: &Place) -> Self {
         let root = place.0.path().canonicalize().unwrap();
-        let (mut folders, mut files) = (vec![root.clone()], vec![]);
-        while let Some(folder) = folders.pop() {
-            for entry in std::fs::read_dir(folder).unwrap() {
-                let path = entry.unwrap().path();
-                if path.is_dir() {
-                    folders.push(path);
-                } else {
-                    files.push((path.strip_prefix(&root).unwrap().to_owned(), std::fs::read(&path).unwrap()));
-                }
-            }
-        }
-        Kept { root: root.to_str().unwrap().to_owned(), files }
+        Kept { files: files_below(&root), root: root.to_str().unwrap().to_owned() }
     }
 
     /// A new place with these files; paths of the old place are replaced.

@@ -3,7 +3,7 @@
 use super::SMALL;
 use super::resume::assert_same;
 use super::signals::{send, stopped};
-use super::{Place, complained, wait};
+use super::{Place, complained, files_below, wait};
 use std::process::{Child, Output, Stdio};
 
 /// Begins a long training in `run` with many checkpoints, and waits for some of them.
@@ -39,24 +39,6 @@ fn lost(what: &str, mut output: Output) {
     complained(what, &output, &[expected, "raygrad train --resume"]);
 }
 
-/// All files of a folder with their contents.
-fn contents(place: &Place, folder: &str) -> Vec<(std::path::PathBuf, Vec<u8>)> {
-    let mut found = vec![];
-    let mut folders = vec![place.path(folder)];
-    while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-            } else {
-                found.push((path.clone(), std::fs::read(path).unwrap()));
-            }
-        }
-    }
-    found.sort();
-    found
-}
-
 #[test]
 fn training_stops_if_its_folder_is_replaced() {
     let place = Place::with_scene();
@@ -73,11 +55,14 @@ fn training_stops_if_its_folder_is_replaced() {
             }
             place.succeeds(&format!("{small} --out run"));
         });
-        let before = contents(&place, "run");
+        let before = files_below(&place.path("run"));
         lost("the first training", ended(first));
         assert_same(&place, "whole", "run");
         // A file being written at that moment is completed.
-        let changed: Vec<_> = contents(&place, "run").into_iter().filter(|file| !before.contains(file)).collect();
+        let changed: Vec<_> = files_below(&place.path("run"))
+            .into_iter()
+            .filter(|(path, bytes)| before.get(path) != Some(bytes))
+            .collect();
         assert!(changed.len() <= 1, "{:?}", changed.iter().map(|(path, _)| path).collect::<Vec<_>>());
         if moves {
             place.succeeds("train --resume moved --steps 1");
@@ -95,11 +80,14 @@ fn training_stops_if_its_run_is_taken_over() {
         let first = begin(&place, "");
         let before = stopped(&first, || {
             std::fs::write(place.path("run/lock.owner"), "1 0123456789abcdef\n").unwrap();
-            contents(&place, "run")
+            files_below(&place.path("run"))
         });
         lost(flags, ended(first));
         // A file being written at that moment is completed.
-        let written: Vec<_> = contents(&place, "run").into_iter().filter(|file| !before.contains(file)).collect();
+        let written: Vec<_> = files_below(&place.path("run"))
+            .into_iter()
+            .filter(|(path, bytes)| before.get(path) != Some(bytes))
+            .collect();
         assert!(written.len() <= 1, "{:?}", written.iter().map(|(path, _)| path).collect::<Vec<_>>());
         place.succeeds("train --resume run --steps 1");
         std::fs::remove_dir_all(place.path("run")).unwrap();

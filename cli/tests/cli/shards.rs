@@ -1,6 +1,6 @@
 //! `--shard` and `raygrad merge`: several programs, one result.
 
-use super::{Place, png, wait};
+use super::{Place, files_below, png, wait};
 use raygrad::nerf::Image;
 use raygrad::nerf::dataset::Split;
 use serde_json::{Value, json};
@@ -11,21 +11,9 @@ use std::process::{Child, Output, Stdio};
 
 const FOLDER: &str = "unfinished-shards";
 
-/// The files below a folder.
+/// The files below a folder of a place.
 fn files(place: &Place, folder: &str) -> BTreeMap<PathBuf, Vec<u8>> {
-    let root = place.path(folder);
-    let (mut folders, mut files) = (vec![root.clone()], BTreeMap::new());
-    while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-            } else {
-                files.insert(path.strip_prefix(&root).unwrap().to_owned(), std::fs::read(&path).unwrap());
-            }
-        }
-    }
-    files
+    files_below(&place.path(folder))
 }
 
 fn start(place: &Place, arguments: &str) -> Child {
