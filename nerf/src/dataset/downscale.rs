@@ -51,7 +51,7 @@ impl Capture {
     /// cannot be read.
     ///
     /// The longest side is then at most 1600 pixels, as nerfstudio's, or 6400 of a panorama. All training images
-    /// together take at most 3 GB. And there are less than two pixels for each of the `cells` along the scene box, or
+    /// together take at most 3 GB. And there are fewer than two pixels for each of the `cells` along the scene box, or
     /// across the NDC frustum, as a grid with those cells does not resolve more; images that are larger than 400 pixels
     /// (1600 for panoramas) stay so.
     pub fn automatic_downscale(&self, analysis: &SceneAnalysis, cells: f64) -> usize {

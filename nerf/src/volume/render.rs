@@ -6,9 +6,8 @@ use super::weights::Weights;
 use crate::camera::rays::Samples;
 use crate::field::Density;
 use raygrad_autograd::{Scalar, Segments, Tensor, Var};
-use std::ops::Add;
-
 use serde::{Deserialize, Serialize};
+use std::ops::Add;
 
 /// Counts of field evaluations.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
