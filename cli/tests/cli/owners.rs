@@ -130,10 +130,12 @@ fn training_recreates_a_removed_folder() {
 fn eval_stops_if_its_folder_is_taken_over() {
     let place = Place::with_run();
     for gone in [false, true] {
-        let name = place.path("run/eval-test-f64/unfinished.lock.owner");
-        let _ = std::fs::remove_file(&name);
+        let folder = place.path("run/eval-test-f64");
+        let name = folder.join("unfinished.lock.owner");
+        let _ = std::fs::remove_dir_all(&folder);
         let mut child = place.command("eval run --precision f64").stderr(Stdio::piped()).spawn().unwrap();
-        wait(&mut child, || name.exists());
+        // This folder is created once the lock is taken.
+        wait(&mut child, || folder.join("unfinished").exists());
         stopped(&child, || match gone {
             true => std::fs::remove_file(&name).unwrap(),
             false => std::fs::write(&name, "1 0123456789abcdef\n").unwrap(),
