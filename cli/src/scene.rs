@@ -5,7 +5,8 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::dataset::{
-    Capture, Dataset, Format, Frame, HoldOut, LoadOptions, SceneAnalysis, SceneType, Split, evenly_spaced,
+    AutomaticDownscale, Capture, Dataset, Format, Frame, HoldOut, LoadOptions, SceneAnalysis, SceneType, Split,
+    evenly_spaced,
 };
 use raygrad::nerf::{Error, Result, SceneBox};
 use raygrad_scenes::{embedded, landscape, landscape_distances};
@@ -161,8 +162,8 @@ impl Opened {
 
     /// The factor that brings images to a size that suits a grid with at most `cells` cells along a scene of this type; 1
     /// for built-in scenes.
-    pub fn automatic_downscale(&self, cells: impl FnOnce(SceneType) -> Result<f64>) -> Result<usize> {
-        let Some((capture, analysis)) = &self.capture else { return Ok(1) };
+    pub fn automatic_downscale(&self, cells: impl FnOnce(SceneType) -> Result<f64>) -> Result<AutomaticDownscale> {
+        let Some((capture, analysis)) = &self.capture else { return Ok(AutomaticDownscale { factor: 1, limit: None }) };
         Ok(capture.automatic_downscale(analysis, cells(analysis.scene_type)?))
     }
 

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use clap::Parser;
 use raygrad::Schedule;
-use raygrad::nerf::dataset::{Dataset, Format, HoldOut, SceneType, Split};
+use raygrad::nerf::dataset::{AutomaticDownscale, Dataset, DownscaleLimit, Format, HoldOut, SceneType, Split};
 use raygrad::nerf::model::RefinedParam;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Error, Preset, Result, StepStats, Trainer, available_memory};
@@ -114,8 +114,8 @@ pub struct Args {
     /// Divide the image size by K [default: automatic]
     ///
     /// A training pixel is the mean of the image pixels that it covers. The default brings the longest side to 1600
-    /// pixels or less, and all training images to 3 GB or less. It also avoids pixels of less than half of the finest
-    /// cells that the budget allows. 1 keeps the size. Range: 1 to 16384.
+    /// pixels or less, and all training images to about 3 GB or less. With a short budget it leaves as few as 800
+    /// pixels, since the model resolves no more. 1 keeps the size. Range: 1 to 16384.
     #[arg(long, help_heading = "Scene", value_name = "K", value_parser = parse::count(1 << 14))]
     downscale: Option<usize>,
     /// Test images: none, every:N, or names
@@ -274,8 +274,8 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     };
     let description = args.format.map_or(Ok(None), |format| source.description(format))?;
     let mut scene = source.open(args.scene_type, args.mask_as_alpha, args.test.as_ref(), description.as_deref())?;
-    let downscale = match args.downscale {
-        Some(factor) => factor,
+    let AutomaticDownscale { factor: downscale, limit } = match args.downscale {
+        Some(factor) => AutomaticDownscale { factor, limit: None },
         None => scene.automatic_downscale(|scene_type| args.most_cells(scene_type))?,
     };
     scene.depth = args.has_depth_loss();
@@ -291,10 +291,15 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     describe(&run, &trainer, &data, &scene)?;
     // Warnings come after all checks, so that an error is the only line of output.
     doctor::warn(&scene);
-    if args.downscale.is_none() && downscale > 1 {
+    if let Some(limit) = limit {
         let [width, height] = [data.frames[0].image.width, data.frames[0].image.height];
+        let limit = match limit {
+            DownscaleLimit::Side => "the longest side has at most 1600 pixels, or 6400 of a panorama",
+            DownscaleLimit::Memory => "all of them take about 3 GB at most",
+            DownscaleLimit::Cells => "this budget resolves no more",
+        };
         complain(&format!(
-            "note: images are downscaled by {downscale}, to {width}x{height}; --downscale 1 keeps their size"
+            "note: images are downscaled by {downscale}, to {width}x{height}: {limit}; --downscale sets another factor"
         ));
     }
 

@@ -176,7 +176,7 @@ fn large_images_are_downscaled() {
     let place = Place::empty();
     let frame = |i: usize| {
         std::fs::create_dir_all(place.path("large/images")).unwrap();
-        let image = Image { width: 3204, height: 8, channels: 3, data: vec![0.25 * i as f32; 3204 * 8 * 3] };
+        let image = Image { width: 3204, height: 6, channels: 3, data: vec![0.25 * i as f32; 3204 * 6 * 3] };
         image.save_png(place.path(&format!("large/images/{i}.png"))).unwrap();
         let matrix = json!([[1, 0, 0, i], [0, 1, 0, i * i], [0, 0, 1, 4], [0, 0, 0, 1]]);
         json!({ "file_path": format!("images/{i}.png"), "transform_matrix": matrix })
@@ -186,18 +186,18 @@ fn large_images_are_downscaled() {
     let train = |flags: &str, run: &str| {
         let said = said(&place, &format!("train large --steps 1 --out {run} {SMALL} {flags}"));
         (
-            said.contains("note: images are downscaled by 8, to 401x1; --downscale 1 keeps their size"),
+            said.contains("note: images are downscaled by 4, to 801x2: this budget resolves no more; --downscale sets"),
             place.json(&format!("{run}/config.json"))["downscale"].clone(),
         )
     };
-    // A grid of a short training resolves no more.
-    assert_eq!(train("", "run"), (true, json!(8)));
+    // Never below 800 pixels.
+    assert_eq!(train("", "run"), (true, json!(4)));
     assert_eq!(train("--downscale 1", "whole"), (false, json!(1)));
     place.succeeds("eval run");
-    assert_eq!(place.json("run/eval-test-fast.json")["downscale"], json!(8));
+    assert_eq!(place.json("run/eval-test-fast.json")["downscale"], json!(4));
     // Renders have the size of training.
     place.succeeds("render run --path test --out views");
-    assert_eq!(png(&place.path("views/0000.png")).width, 401);
+    assert_eq!(png(&place.path("views/0000.png")).width, 801);
 }
 
 #[test]

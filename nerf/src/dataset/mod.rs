@@ -31,6 +31,7 @@ pub use batch::Batch;
 pub use capture::{Capture, Format, Point, View};
 pub use color_space::{SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};
 pub use depth::Depths;
+pub use downscale::{AutomaticDownscale, DownscaleLimit};
 pub use frames::{Dataset, Frame, Split, evenly_spaced};
 pub use hold_out::HoldOut;
 pub use load::LoadOptions;
