@@ -213,7 +213,7 @@ fn carve_views(grid: &mut OccupancyGrid, views: &[Silhouette], votes: u32) {
     grid.carve(&|centre, radius| {
         views.iter().filter(|view| view.is_clear(centre, radius)).take(votes).count() == votes
     });
-    grid.occupy_all_but_carved();
+    grid.empty_carved();
 }
 
 #[cfg(test)]

@@ -37,7 +37,7 @@ impl Cone {
 pub(crate) fn carve_unseen(grid: &mut OccupancyGrid, data: &Dataset) {
     let cones: Vec<Cone> = data.frames.iter().map(|frame| Cone::new(&frame.camera)).collect();
     grid.carve(&|centre, radius| !cones.iter().any(|cone| cone.sees(centre, radius, data.near)));
-    grid.occupy_all_but_carved();
+    grid.empty_carved();
 }
 
 #[cfg(test)]

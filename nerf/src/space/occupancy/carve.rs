@@ -10,8 +10,8 @@ impl OccupancyGrid {
     /// Permanently empties the cells for which `is_empty(centre, radius)` holds, with a ball around the cell in scene
     /// units.
     ///
-    /// They are never sampled again. Occupancy changes with the next [`threshold`](Self::threshold) or
-    /// [`occupy_all_but_carved`](Self::occupy_all_but_carved).
+    /// They are never sampled again, from the next [`threshold`](Self::threshold) or
+    /// [`empty_carved`](Self::empty_carved) on.
     pub fn carve(&mut self, is_empty: &(dyn Fn(DVec3, f64) -> bool + Sync)) {
         let lattice = &self.lattice;
         let tasks = Arc::make_mut(&mut self.densities).chunks_mut(CELLS * TASK);
@@ -36,9 +36,10 @@ impl OccupancyGrid {
         });
     }
 
-    /// Marks all cells occupied, except carved ones.
-    pub fn occupy_all_but_carved(&mut self) {
-        let words = self.exceeding(CARVED);
+    /// Marks carved cells empty. The occupancy of others stays.
+    pub fn empty_carved(&mut self) {
+        let mut words = self.exceeding(CARVED);
+        words.iter_mut().zip(&self.words).for_each(|(left, occupied)| *left &= occupied);
         self.occupy(words, false);
     }
 }

@@ -283,7 +283,7 @@ fn pruning_empties_faint_cells_and_fills_none() {
     let mut grid = grid(32, 1);
     // Half of the box; the field is not evaluated elsewhere.
     grid.carve(&|centre, radius| centre.x + radius < 0.0);
-    grid.occupy_all_but_carved();
+    grid.empty_carved();
     let before = set(&grid.words, &grid.lattice);
     assert!((0.45..0.55).contains(&grid.occupied_share()));
     let asked = Mutex::new(0);
