@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Instant;
 
+use raygrad::nerf::model::PoseMotion;
 use raygrad::nerf::{Budget, Result, StepStats};
 use serde::{Deserialize, Serialize};
 
@@ -81,7 +82,7 @@ struct Summary<'a> {
     skipped_share: Option<Shares>,
     restarts: u32,
     /// Image motion at the check of the poses, in degrees; null without one.
-    pose_motion: Option<f64>,
+    pose_motion: Option<PoseMotion>,
     /// Number of gradient elements that were not finite.
     non_finite_gradients: u64,
     threads: usize,
@@ -234,7 +235,7 @@ mod tests {
             unskipped: 200,
             non_finite: 3,
             restarts: 2,
-            pose_motion: Some(0.5),
+            pose_motion: Some(PoseMotion { median: 0.5, largest: 0.75 }),
             ..at(150)
         };
         let ended = write(&account, &counts, Some(Ended::Interrupted));
@@ -248,7 +249,7 @@ mod tests {
             json!({ "placed_samples": 0.75, "density_queries": 0.8, "color_queries": 0.95 })
         );
         assert_eq!([&ended["non_finite_gradients"], &ended["restarts"]], [&json!(3), &json!(2)]);
-        assert_eq!(ended["pose_motion"], 0.5);
+        assert_eq!(ended["pose_motion"], json!({ "median": 0.5, "largest": 0.75 }));
         // After divergence, the run returns to a step before the preview.
         account.retreat();
         account.cut(139);

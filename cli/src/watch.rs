@@ -5,6 +5,7 @@ use std::io::ErrorKind;
 use std::path::Path;
 use std::time::Duration;
 
+use raygrad::nerf::model::PoseMotion;
 use raygrad::nerf::{Budget, Error, Result, StepStats, Trainer, write_atomic};
 
 use super::checkpoint;
@@ -53,7 +54,7 @@ pub struct Watch<'a> {
     next_save: f64,
     psnr: Option<f64>,
     /// Image motion at the check of the poses, if that was before the last step.
-    pose_motion: Option<f64>,
+    pose_motion: Option<PoseMotion>,
     progress: Progress,
     /// Warnings about files that were printed already.
     warned: HashSet<String>,
@@ -380,14 +381,17 @@ fn kept_metrics(path: &Path, step: u64) -> Result<(String, u64)> {
 fn pose_check(stats: &StepStats) -> Option<String> {
     let found = match stats.given_poses_are_right() {
         true => "the given poses are right, and are hardly refined from here on",
-        false => "the given poses are wrong, and detail fades in while they are refined",
+        false => "some given poses are wrong, and detail fades in while all are refined",
     };
-    stats.pose_motion.map(|motion| format!("poses    moved images by {motion:.2} degrees: {found}"))
+    let told = |PoseMotion { median, largest }| {
+        format!("poses    moved images by {median:.2} degrees, and one by {largest:.2}: {found}")
+    };
+    stats.pose_motion.map(told)
 }
 
 /// Named scalars of the metrics, and the training speed.
 fn scalars(values: &Value, stats: &StepStats) -> Vec<(String, f64)> {
-    let named = values.as_object().into_iter().flatten().filter(|(name, _)| *name != "step");
+    let named = values.as_object().into_iter().flatten().filter(|(name, value)| *name != "step" && !value.is_object());
     // Values that are not finite are null in the metrics.
     let named = named.map(|(name, value)| (format!("train/{name}"), value.as_f64().unwrap_or(f64::NAN)));
     let speed = ("train/rays_per_second".to_owned(), stats.rays as f64 / stats.train_seconds);
@@ -407,9 +411,11 @@ mod tests {
     fn check_of_poses_is_told_with_its_motion() {
         let told = |pose_motion| pose_check(&StepStats { pose_motion, ..StepStats::default() });
         assert_eq!(told(None), None);
-        let [right, wrong] = [0.384, 1.9].map(|motion| told(Some(motion)).unwrap());
-        assert!(right.contains("by 0.38 degrees: the given poses are right"), "{right}");
-        assert!(wrong.contains("by 1.90 degrees: the given poses are wrong"), "{wrong}");
+        let [right, some, wrong] = [(0.384, 0.5), (0.384, 0.9), (1.9, 2.0)]
+            .map(|(median, largest)| told(Some(PoseMotion { median, largest })).unwrap());
+        assert!(right.contains("by 0.38 degrees, and one by 0.50: the given poses are right"), "{right}");
+        assert!(some.contains("by 0.38 degrees, and one by 0.90: some given poses are wrong"), "{some}");
+        assert!(wrong.contains("by 1.90 degrees, and one by 2.00: some given poses are wrong"), "{wrong}");
     }
 
     #[test]

@@ -10,7 +10,7 @@ mod registry;
 mod scene_box;
 mod store;
 
-pub use camera_optimizer::{CameraOptimizer, CameraOptimizerConfig, RefinedParam};
+pub use camera_optimizer::{CameraOptimizer, CameraOptimizerConfig, PoseMotion, RefinedParam};
 pub(crate) use camera_optimizer::{FOCAL, LENS, POSES};
 pub use config::{Config, GroupConfig, Preset};
 pub(crate) use exposure::{EXPOSURE, VIGNETTING};

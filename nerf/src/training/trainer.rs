@@ -23,7 +23,8 @@ use std::time::{Duration, Instant};
 const RAYS: [usize; 2] = [256, 1 << 16];
 /// Steps between releases of unused memory: the number of samples changes during training.
 const TRIM_EVERY: u64 = 256;
-/// The fewest steps of a model after which poses are checked: they begin at 0 and need time to move.
+/// The fewest steps of a model, and rays of an image, after which poses are checked: they begin at 0 and need time to
+/// move.
 const CHECKED_STEPS: u64 = 100;
 /// The factor of the poses' learning rate once the given poses are right.
 const RIGHT_LR_SCALE: f64 = 0.02;
@@ -259,7 +260,8 @@ impl Trainer {
     fn check_poses(&mut self, fraction: f64) {
         let check_at = self.model.config.camera_optimizer.check_at;
         // The steps are those of the model, as a restart begins with the given poses.
-        let is_due = check_at > 0.0 && fraction >= check_at && self.groups.steps() >= CHECKED_STEPS;
+        let updates = self.groups.steps().min(self.done.rays / self.data.frames.len().max(1) as u64);
+        let is_due = check_at > 0.0 && fraction >= check_at && updates >= CHECKED_STEPS;
         let Some(optimizer) = self.model.camera_optimizer.as_ref().filter(|_| is_due) else { return };
         if self.done.pose_motion.is_some() {
             return;

@@ -14,6 +14,7 @@ use crate::camera::rays::Rays;
 use crate::camera::{rotation_exp, rotation_matrix};
 use crate::dataset::SceneTransform;
 use crate::model::scene_box::SceneBox;
+use crate::numbers::median;
 use crate::volume::query::RayVars;
 use crate::{Error, Result};
 use balance::{Matrix, POSE, balance, plain};
@@ -21,6 +22,7 @@ use glam::{DAffine3, DVec3};
 use newton::{CORRECTIONS, with_corrections};
 use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId, Params};
+use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// Relative tolerance for equal focal lengths and principal points.
@@ -99,6 +101,16 @@ fn with_glass(camera: &Camera) -> Camera {
         lens => lens,
     };
     Camera { lens, ..camera.clone() }
+}
+
+/// How far pose refinement has moved the images, in degrees. The motion of an image is the root mean square over its
+/// points.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PoseMotion {
+    /// The median of all images.
+    pub median: f64,
+    /// The largest of all images.
+    pub largest: f64,
 }
 
 impl CameraOptimizer {
@@ -227,12 +239,13 @@ impl CameraOptimizer {
         (RayVars { origins, directions }, moved)
     }
 
-    /// Returns how far the pose corrections move the images: the root mean square over images and their points, in
-    /// degrees. `None` if poses are not learned.
-    pub fn pose_motion<T: Scalar>(&self, params: &Params<T>) -> Option<f64> {
+    /// Returns how far the pose corrections move the images. `None` if poses are not learned.
+    pub fn pose_motion<T: Scalar>(&self, params: &Params<T>) -> Option<PoseMotion> {
         // In preconditioned parameters, the squared length of a row is an image's mean squared motion.
-        let sum: f64 = params.get(self.poses?).as_slice().iter().map(|x| x.to_f64().powi(2)).sum();
-        Some((sum / self.balance.len() as f64).sqrt().to_degrees())
+        let motion = |row: &[T]| row.iter().map(|x| x.to_f64().powi(2)).sum::<f64>().sqrt().to_degrees();
+        let each: Vec<f64> = params.get(self.poses?).as_slice().chunks_exact(POSE).map(motion).collect();
+        let largest = each.iter().copied().fold(0.0, f64::max);
+        Some(PoseMotion { median: median(each), largest })
     }
 
     /// Restores the given poses.

@@ -11,6 +11,7 @@ use crate::model::RefinedParam;
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
+use crate::space::occupancy::Threshold;
 use crate::training::stats::STUCK;
 use crate::{FieldConfig, Preset};
 use glam::DVec3;
@@ -189,7 +190,7 @@ fn keeps_given_poses(trainer: &Trainer) -> bool {
 
 #[test]
 fn poses_that_hardly_move_are_restored() {
-    for (motion, right) in [(0.4, true), (0.6, false)] {
+    for (motion, right) in [(0.3, true), (0.39, true), (0.41, false), (0.6, false)] {
         let mut trainer = refining(&[RefinedParam::Poses], 100, motion);
         // Too early in the run.
         trainer.step(0.04);
@@ -197,11 +198,11 @@ fn poses_that_hardly_move_are_restored() {
         let poses = trainer.model.params.find(POSES).unwrap();
         trainer.model.params.set_lr_scale(|name| name == POSES, 0.5);
         let found = trainer.step(0.05).pose_motion.unwrap();
-        assert!((found - motion).abs() < 0.05, "{found} {motion}");
+        assert!((found.median - motion).abs() < 0.02, "{found:?} {motion}");
         let scale = trainer.model.params.lr_scale(poses);
         assert!((scale - if right { 0.01 } else { 0.5 }).abs() < 1e-12, "{scale}");
         let left = trainer.model.camera_optimizer.as_ref().unwrap().pose_motion(&trainer.model.params).unwrap();
-        assert!((left < 0.01) == right && (left > 0.5) != right, "{left}");
+        assert!((left.median < 0.01) == right && (left.median > 0.3) != right, "{left:?}");
         assert_eq!((keeps_given_poses(&trainer), trainer.stats().given_poses_are_right()), (right, right));
         // The first check counts, also after a restart.
         trainer.model.params.get_mut(poses).as_mut_slice().fill(if right { 0.1 } else { 0.0 });
@@ -235,14 +236,19 @@ fn right_poses_carve_unless_lenses_are_refined() {
         let mut trainer = refining(parts, 100, motion);
         let before = trainer.stats().occupied;
         trainer.check_poses(0.2);
-        assert!(trainer.stats().pose_motion.is_some_and(|found| (found - motion).abs() < 0.01), "{parts:?}");
-        assert_eq!(trainer.stats().occupied, if carves { carved } else { before }, "{parts:?} {motion}");
+        assert!(trainer.stats().pose_motion.is_some_and(|found| (found.median - motion).abs() < 0.01), "{parts:?}");
+        // Cells that are known to be empty stay so.
+        let after = trainer.stats().occupied;
+        assert!(after <= before && (carves || after == before), "{parts:?} {motion}: {after}, {before} before");
+        let mut grid = trainer.model.sampler.grid().unwrap().clone();
+        grid.threshold(&Threshold { min_sigma: -1.0, or_mean: false, dilate: false });
+        assert_eq!(grid.occupied_share(), if carves { carved } else { 1.0 }, "{parts:?} {motion}");
     }
 }
 
 #[test]
 fn run_resumes_before_and_after_the_check_of_poses() {
-    for motion in [0.4, 0.6] {
+    for motion in [0.3, 0.6] {
         let mut trainer = refining(&[RefinedParam::Poses], 100, motion);
         let fractions = [0.04, 0.05, 0.06];
         for i in 0..3 {
@@ -257,7 +263,7 @@ fn run_resumes_before_and_after_the_check_of_poses() {
             fractions[i + 1..].iter().for_each(|fraction| _ = rest.step(*fraction));
             assert_eq!(later.model.params.values(), rest.model.params.values(), "{motion} {i}");
             assert_eq!(later.stats().pose_motion, rest.stats().pose_motion);
-            assert!(later.stats().pose_motion.is_some() && keeps_given_poses(&later) == (motion < 0.45));
+            assert!(later.stats().pose_motion.is_some() && keeps_given_poses(&later) == (motion < 0.4));
         }
     }
 }
