@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::Error;
 
 use super::interrupt::{self, Work};
-use super::output::print;
+use super::output::{entries, print};
 use super::prepare::convert;
 use super::shard::{self, Complete, Progress, Shard};
 use super::{eval, render};
@@ -18,7 +18,7 @@ use super::{eval, render};
 /// Example: raygrad merge orbit.mp4
 #[derive(clap::Args)]
 pub struct Args {
-    /// The --out of the shards, or RUN/eval-SPLIT-SKIP
+    /// The --out of the shards; of `eval` the run, or its folder RUN/eval-SPLIT-SKIP
     out: PathBuf,
 }
 
@@ -28,15 +28,13 @@ pub fn run(args: &Args) -> Work<()> {
     let out = &args.out;
     let mut places = vec![out.clone(), render::frames_of(out)];
     places.extend(convert::staging(out));
+    places.extend(entries(out).unwrap_or_default());
     let at = places.into_iter().find(|place| place.join(shard::FOLDER).is_dir()).unwrap_or_else(|| out.clone());
     // The result is beside it, and `.` has no name.
     let at = if at.file_name().is_none() { at.canonicalize().unwrap_or(at) } else { at };
     let what = match shard::progress(&at)? {
         Progress::Complete(complete) => return merge(*complete),
-        Progress::None => {
-            "holds no shards: name the --out of `render` or `prepare`, or the folder RUN/eval-SPLIT-SKIP of `eval`"
-                .into()
-        }
+        Progress::None => "holds no shards: name the --out of `render` or `prepare`, or the run of `eval`".into(),
         Progress::Merging => "another raygrad merges the shards: wait until it ends".into(),
         Progress::Incomplete(missing) => {
             format!("misses shards {missing}: wait for those that run, repeat the others with --shard")

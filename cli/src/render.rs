@@ -284,7 +284,8 @@ impl Output {
     fn complete(&self, frames: Frames, job: &Job, out: &Path, again: &str) -> Work<()> {
         let &Output { kind, frames: count, size, fps, keep_frames } = self;
         if let Kind::Video(video) = kind {
-            let written = video.write(&VideoWriter { folder: frames.folder(), count, size, fps, job }, out);
+            let (folder, check) = (frames.folder(), &|| frames.check_lock());
+            let written = video.write(&VideoWriter { folder, count, size, fps, job, check }, out);
             if let Err(Stop::Interrupted) = written {
                 frames.stopped(again)?;
             }

@@ -274,7 +274,8 @@ impl Record {
             each.map(|(name, there, here)| format!("`{name}` is {there} there, {here} here")).collect();
         let more = if differences.len() > NAMED { ", ..." } else { "" };
         let what = format!(
-            "holds shards of another job: {}{more}; use the same arguments, or remove {} to start again",
+            "holds shards of another job: {}{more}; use the same arguments, or remove {} and what its shards wrote beside it \
+             to start again",
             each.join(", "),
             at.join(FOLDER).display()
         );
@@ -511,6 +512,8 @@ mod tests {
                 [begin("1/2", 7), other.join().unwrap()]
             });
             assert_ne!(both, [true; 2]);
+            // A refused one leaves nothing that keeps the other from beginning.
+            assert_eq!(open(at, "1/2", json!({ "size": 7 })).is_ok(), !both[1], "{both:?}");
         }
     }
 
@@ -523,7 +526,7 @@ mod tests {
         let error = open(at, "2/2", of(3)).err().unwrap().to_string();
         let expected = format!(
             "{}: holds shards of another job: `path` is \"{}... there, \"aaa\" here, `size` is 100 there, 3 here; use the \
-             same arguments, or remove {} to start again",
+             same arguments, or remove {} and what its shards wrote beside it to start again",
             at.display(),
             "a".repeat(59),
             at.join(FOLDER).display()

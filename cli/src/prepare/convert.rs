@@ -18,7 +18,9 @@ use super::{bounds, next};
 use crate::interrupt::Work;
 use crate::merge;
 use crate::output::{complain, entries, note, print, remove};
+use crate::parse::read_text;
 use crate::progress::Progress;
+use crate::run::write_json;
 use crate::shard::{self, Complete, Part, Shard, Whole};
 
 /// Formats that can be written.
@@ -149,10 +151,18 @@ impl Conversion {
             "allow_outside": self.allow_outside,
         });
         let whole = Whole { command: COMMAND.to_owned(), inputs, items: self.capture.views.len() };
-        let mut part = Part::open(&at, shard, whole, Value::Null)?;
         let folder = at.join(DATASET);
+        // A shard writes its record first, and only merging removes it.
+        if folder.exists() && shard::own_facts::<Value>(&at)?.is_empty() {
+            return Err(Error::file(&at, "holds a dataset without the records of its shards: remove it").into());
+        }
+        let mut part = Part::open(&at, shard, whole, Value::Null)?;
         create_folder(&folder)?;
         let jobs = self.write(&folder)?;
+        let inside = |path: &Path| path.strip_prefix(&folder).unwrap_or(path).to_owned();
+        let list: Vec<Vec<PathBuf>> = jobs.iter().map(|job| job.files().map(inside).collect()).collect();
+        write_json(&at.join(LIST), &list)?;
+        part.retain(|i| jobs[i].files().all(Path::is_file))?;
         let items: Vec<usize> = part.items().skip(part.done()).collect();
         let progress = Progress::new();
         for items in items.chunks(4 * rayon::current_num_threads()) {
@@ -215,6 +225,8 @@ impl Conversion {
 pub const COMMAND: &str = "prepare";
 /// The folder of the dataset in [`staging`].
 const DATASET: &str = "dataset";
+/// The list of each image's files in [`staging`], as paths in the dataset.
+const LIST: &str = "files.json";
 
 /// The folder of unfinished shards of a dataset, beside it.
 pub fn staging(out: &Path) -> Result<PathBuf> {
@@ -238,6 +250,12 @@ pub fn merge(complete: Complete) -> Work<()> {
     if dataset.exists() {
         if out.symlink_metadata().is_ok() {
             return Err(Error::file(&out, "exists: move it away, then run `raygrad merge` again").into());
+        }
+        let list = at.join(LIST);
+        let text = read_text(&list, "a list of images")?;
+        let files: Vec<Vec<PathBuf>> = serde_json::from_str(&text).map_err(|e| Error::file(&list, e))?;
+        for (i, files) in files.iter().enumerate() {
+            files.iter().try_for_each(|file| complete.check(i, &dataset.join(file)))?;
         }
         remove_temporary(&dataset)?;
         rename_durable(&dataset, &out)?;
@@ -388,11 +406,17 @@ fn inner(path: &str) -> &str {
 }
 
 impl Job {
+    /// The files that [`run`](Self::run) writes.
+    fn files(&self) -> impl Iterator<Item = &Path> {
+        let View { image, mask, depth, .. } = &self.to;
+        let mask = mask.as_ref().filter(|_| image.is_some());
+        let depth = depth.as_ref().map(|(path, _)| path);
+        [image.as_ref(), mask, depth].into_iter().flatten().map(PathBuf::as_path)
+    }
+
     /// Flushes the files, which a record then counts as complete.
     fn sync(&self) -> Result<()> {
-        let depth = self.to.depth.as_ref().map(|(path, _)| path);
-        let files = [self.to.image.as_ref(), self.to.mask.as_ref(), depth].into_iter().flatten();
-        files.filter(|path| path.is_file()).try_for_each(|path| {
+        self.files().try_for_each(|path| {
             let synced = std::fs::File::open(path).and_then(|file| file.sync_all());
             synced.map_err(|e| Error::file(path, format!("cannot be written: {e}")))
         })

@@ -201,7 +201,7 @@ impl Frames {
     }
 
     /// Checks that the folder is still the locked one.
-    fn check_lock(&self) -> Result<()> {
+    pub fn check_lock(&self) -> Result<()> {
         let Claim::All(_, lock) = &self.claim else { return Ok(()) };
         let what = match lock.state() {
             State::Kept => return Ok(()),

@@ -47,6 +47,8 @@ pub struct VideoWriter<'a> {
     pub fps: f64,
     /// The job, whose mark goes into the file's metadata.
     pub job: &'a Job,
+    /// Checks, before the video replaces a file, that the frames are still the program's.
+    pub check: &'a dyn Fn() -> Result<()>,
 }
 
 impl VideoFormat {
@@ -108,12 +110,13 @@ impl VideoFormat {
             VideoFormat::Mp4 | VideoFormat::Webm => self.encode(reel, out, &file)?,
         }
         reel.job.check(out)?;
+        (reel.check)()?;
         Ok(rename_durable(&file, out)?)
     }
 
     /// Encodes with ffmpeg.
     fn encode(self, reel: &VideoWriter<'_>, out: &Path, file: &Path) -> Work<()> {
-        let &VideoWriter { folder, count, size, fps, job } = reel;
+        let &VideoWriter { folder, count, size, fps, job, .. } = reel;
         let even = size.map(|side| side.next_multiple_of(2));
         if even != size {
             let [width, height] = even;
@@ -194,10 +197,11 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let (folder, out) = (place.path(), place.path().join("walk.gif"));
         Image::new(4, 3, 3).save_png(folder.join(numbered(0, DIGITS))).unwrap();
-        let write = |video: VideoFormat, overwrites: bool| {
+        let written = |video: VideoFormat, overwrites: bool, check: &dyn Fn() -> Result<()>| {
             let job = Job::new("render", &Value::Null, overwrites);
-            video.write(&VideoWriter { folder, count: 1, size: [4, 3], fps: 10.0, job: &job }, &out)
+            video.write(&VideoWriter { folder, count: 1, size: [4, 3], fps: 10.0, job: &job, check }, &out)
         };
+        let write = |video: VideoFormat, overwrites: bool| written(video, overwrites, &|| Ok(()));
         for video in [VideoFormat::Gif, VideoFormat::Apng] {
             std::fs::write(&out, b"footage").unwrap();
             let Err(Stop::Failed(error)) = write(video, false) else { panic!("{video:?} is written") };
@@ -205,6 +209,9 @@ mod tests {
                 error.to_string().contains("walk.gif: exists, and another command or other options made it"),
                 "{error}"
             );
+            assert_eq!(std::fs::read(&out).unwrap(), b"footage");
+            // Another program has taken the frames meanwhile.
+            assert!(written(video, true, &|| Err(Error::file(folder, "is lost"))).is_err());
             assert_eq!(std::fs::read(&out).unwrap(), b"footage");
             write(video, true).unwrap();
             // The job's own file is replaced.

@@ -52,14 +52,18 @@ fn said(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Runs the last shard while it cannot know of the first, as if it was killed before it merged.
+/// Runs the last shard while the first seems to have begun, as if the last was killed before it merged.
 fn unmerged(place: &Place, command: &str, at: &str) {
     place.succeeds(&format!("{command} --shard 1/2"));
-    let [file, aside] = [format!("{at}/{FOLDER}/shard-1.json"), "aside".into()].map(|name| place.path(&name));
-    std::fs::rename(&file, &aside).unwrap();
+    let file = place.path(&format!("{at}/{FOLDER}/shard-1.json"));
+    let mut changed = record(place, at, 1).unwrap();
+    let share = changed["done"].take();
+    changed["done"] = json!(0);
+    std::fs::write(&file, changed.to_string()).unwrap();
     let printed = place.succeeds(&format!("{command} --shard 2/2"));
-    assert_eq!(printed, "shard    2/2 is complete; still missing 1/2 (not begun)\n");
-    std::fs::rename(&aside, &file).unwrap();
+    assert_eq!(printed, format!("shard    2/2 is complete; still missing 1/2 (stopped, 0 of {share})\n"));
+    changed["done"] = share;
+    std::fs::write(&file, changed.to_string()).unwrap();
 }
 
 #[test]
@@ -123,7 +127,8 @@ fn shard_of_another_job_is_refused() {
     let render = "render run --frames 4 --size 8x6 --out out";
     place.succeeds(&format!("{render} --shard 1/2"));
     let before = files(&place, "out");
-    let again = format!("use the same arguments, or remove out/{FOLDER} to start again");
+    let again =
+        format!("use the same arguments, or remove out/{FOLDER} and what its shards wrote beside it to start again");
     let refused = |command: &str, differences: &[&str]| {
         let expected = [&["out: holds shards of another job: "], differences, &[&again]].concat();
         place.fails(command, &expected);
@@ -147,8 +152,8 @@ fn shard_of_another_job_is_refused() {
     place.succeeds("train --resume run --steps 4");
     refused(&format!("{render} --shard 2/2"), &["`model` is \""]);
     // As the message says.
-    std::fs::remove_dir_all(place.path(&format!("out/{FOLDER}"))).unwrap();
-    at_once(&place, render, 2);
+    std::fs::remove_dir_all(place.path("out")).unwrap();
+    at_once(&place, &format!("{render} --background black"), 2);
     for (shard, flags) in [("1/2", "--out one.png"), ("1/1", "--out one.png")] {
         place.fails_with(
             &format!("render run {flags} --shard {shard}"),
@@ -213,22 +218,37 @@ fn merge_makes_the_result_of_complete_shards() {
     };
     write("done", json!(1));
     place.fails_with("merge film.gif", &missing("1/3 (not begun), 2/3 (stopped, 1 of 2), 3/3 (not begun)"));
-    // Damaged records.
-    for (key, value) in
-        [("done", json!(3)), ("shards", json!(1)), ("items", json!(1e18 as u64)), ("inputs", Value::Null)]
-    {
+    // Damaged records, and those of another job.
+    let unsound = "is no record of this raygrad (its numbers do not fit)";
+    for (key, value, why) in [
+        ("done", json!(3), unsound),
+        ("shards", json!(1), unsound),
+        ("items", json!(10_000_001), unsound),
+        ("inputs", Value::Null, "holds shards of another job"),
+        ("items", json!(10_000_000), "holds shards of another job"),
+    ] {
         write(key, value);
-        place.fails(&format!("{render} film.gif --shard 1/3"), &["film.gif.frames"]);
+        place.fails(&format!("{render} film.gif --shard 1/3"), &["film.gif.frames", why]);
     }
     std::fs::write(&file, "{").unwrap();
     place.fails("merge film.gif", &["shard-2.json: is no record of this raygrad", "remove it and run its shard again"]);
     std::fs::remove_dir_all(place.path("film.gif.frames")).unwrap();
     // The last shard was killed before it merged.
     unmerged(&place, &format!("{render} film.gif"), "film.gif.frames");
-    let frame = place.path("film.gif.frames/0003.png");
+    let frame = place.path("film.gif.frames/0004.png");
     std::fs::rename(&frame, place.path("aside")).unwrap();
-    place.fails("merge film.gif", &["0003.png: is missing: remove ", "shard-2.json and run shard 2/2 again"]);
+    place.fails("merge film.gif", &["0004.png: is missing: remove ", "shard-1.json and run shard 1/2 again"]);
     std::fs::rename(place.path("aside"), &frame).unwrap();
+    // Records of two jobs. The folder held other images only if all shards saw them.
+    let first = place.path(&format!("film.gif.frames/{FOLDER}/shard-1.json"));
+    let sound = record(&place, "film.gif.frames", 1).unwrap();
+    let mut changed = sound.clone();
+    changed["inputs"]["of"]["size"] = json!([9, 6]);
+    std::fs::write(&first, changed.to_string()).unwrap();
+    place.fails("merge film.gif", &["holds shards of another job: `size` is [9,6] there, [8,6] here"]);
+    changed.clone_from(&sound);
+    changed["own"]["strange"] = json!(true);
+    std::fs::write(&first, changed.to_string()).unwrap();
     assert!(!place.path("film.gif").exists());
     let lock = File::create(place.path("film.gif.frames/unfinished.lock")).unwrap();
     lock.lock().unwrap();
@@ -246,7 +266,10 @@ fn merge_makes_the_result_of_complete_shards() {
 #[test]
 fn prepare_in_shards_equals_the_whole() {
     let place = Place::with_scene();
-    for flags in ["--to nerfstudio", "--undistort", "--to llff"] {
+    let mut transforms = place.transforms(Split::Train);
+    transforms["k1"] = json!(0.05);
+    place.write_transforms(Split::Train, &transforms);
+    for flags in ["--to nerfstudio", "--undistort", "--undistort --to llff"] {
         let convert = format!("prepare scene {flags} --out");
         place.succeeds(&format!("{convert} whole"));
         for count in [1, 2, 5] {
@@ -266,10 +289,30 @@ fn prepare_in_shards_equals_the_whole() {
     std::fs::remove_dir_all(place.path("made")).unwrap();
     place.succeeds(&format!("{convert} --shard 1/2"));
     place.fails("prepare scene --to llff --out made --shard 2/2", &["`to` is \"colmap\" there, \"llff\" here"]);
+    place.fails(&format!("{convert} --undistort --shard 2/2"), &["`undistort` is false there, true here"]);
+    transforms["frames"][0]["transform_matrix"][0][3] = json!(0.5);
+    place.write_transforms(Split::Train, &transforms);
+    place.fails(&format!("{convert} --shard 2/2"), &["`images` is \""]);
     place.fails("merge made", &["made: misses shards 2/2 (not begun)"]);
+    // Files of a removed job do not get into another one.
+    std::fs::remove_dir_all(place.path(&format!(".made-unfinished-shards/{FOLDER}"))).unwrap();
+    place.fails(
+        &format!("{convert} --shard 1/2"),
+        &[".made-unfinished-shards: holds a dataset without the records of its shards: remove it"],
+    );
     place.fails_with("prepare scene --out new --shard 1/2", "`shard`: needs a conversion: add --to or --undistort");
     std::fs::remove_dir_all(place.path(".made-unfinished-shards")).unwrap();
     unmerged(&place, convert, ".made-unfinished-shards");
+    // A shard converts what has gone, and only that.
+    let image = |i: usize| place.path(&format!(".made-unfinished-shards/dataset/images/train/r_{i}.png"));
+    std::fs::remove_file(image(2)).unwrap();
+    place.fails("merge made", &["r_2.png: is missing: remove ", "shard-1.json and run shard 1/2 again"]);
+    let before = std::fs::metadata(image(0)).unwrap().modified().unwrap();
+    let second = place.path(&format!(".made-unfinished-shards/{FOLDER}/shard-2.json"));
+    std::fs::rename(&second, place.path("aside")).unwrap();
+    place.succeeds(&format!("{convert} --shard 1/2"));
+    std::fs::rename(place.path("aside"), second).unwrap();
+    assert!(image(2).exists() && std::fs::metadata(image(0)).unwrap().modified().unwrap() == before);
     std::fs::write(place.path(".made-unfinished-shards/dataset/images/.raygrad-tmp-abc"), b"half").unwrap();
     place.succeeds("merge made");
     assert!(!place.path("made/images/.raygrad-tmp-abc").exists() && place.path("made/images").is_dir());
@@ -335,9 +378,16 @@ fn eval_in_shards_equals_the_whole() {
     let done = killed(&place, "--threads 2 eval run --shard 1/2", "run/eval-test");
     let output = place.command("--threads 2 eval run --shard 1/2").output().unwrap();
     assert!(done == 12 || said(&output).contains(&format!("resuming after {done} of 12 images of shard 1/2")));
-    std::fs::remove_dir_all(place.path(&format!("run/eval-test/{FOLDER}"))).unwrap();
+    // A view that has gone is measured again.
+    std::fs::remove_file(place.path(&format!("run/eval-test/{FOLDER}/view-2.json"))).unwrap();
+    place.fails("merge run/eval-test", &["misses shards 2/2 (not begun)"]);
+    let output = place.command("--threads 2 eval run --shard 1/2").output().unwrap();
+    assert!(said(&output).contains("resuming after 1 of 12 images of shard 1/2"));
+    place.succeeds("--threads 2 eval run --shard 2/2");
+    assert!(result(&place) == whole);
+    remove();
     unmerged(&place, "--threads 2 eval run", "run/eval-test");
-    place.succeeds("merge run/eval-test/");
+    place.succeeds("merge run");
     assert!(result(&place) == whole);
     remove();
     unmerged(&place, "--threads 2 eval run", "run/eval-test");
