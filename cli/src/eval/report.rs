@@ -348,7 +348,10 @@ mod tests {
         let of =
             |psnr: f64, ssim, lpips| serde_json::to_string(&Score { name: "a".into(), psnr, ssim, lpips }).unwrap();
         for (psnr, expected) in [(31.5, "31.5"), (f64::INFINITY, "\"inf\""), (f64::NAN, "\"NaN\"")] {
-            assert_eq!(of(psnr, None, None), format!("{{\"name\":\"a\",\"psnr\":{expected},\"ssim\":null}}"));
+            let alone = format!("{{\"name\":\"a\",\"psnr\":{expected},\"ssim\":null}}");
+            assert_eq!(of(psnr, None, None), alone);
+            let read: Score = serde_json::from_str(&alone).unwrap();
+            assert!(read.psnr.total_cmp(&psnr) == Ordering::Equal && read.ssim.is_none());
             let all = format!("{{\"name\":\"a\",\"psnr\":1.0,\"ssim\":{expected},\"lpips\":{expected}}}");
             assert_eq!(of(1.0, Some(psnr), Some(psnr)), all);
             let read: Score = serde_json::from_str(&all).unwrap();

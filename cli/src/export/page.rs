@@ -305,6 +305,32 @@ mod tests {
         assert!(darkest < 0.9, "the fog is visible: {darkest}");
     }
 
+    /// Steps skip cells without density. A bounded model has one box.
+    #[test]
+    fn steps_in_place_of_proposals_skip_empty_cells() {
+        for unbounded in [false, true] {
+            let mut model = model(small(), |config, _| {
+                config.sampler = SamplerConfig::new(ProposalConfig::default());
+                if unbounded {
+                    *config = config.clone().with_scene_type(SceneType::Unbounded);
+                }
+            });
+            let occupied = |model: Model<f32>| {
+                let stepped = marched(model).unwrap();
+                let grid = stepped.marching().unwrap().view_grid();
+                assert_eq!(grid.bounds() != grid.outer_bounds(), unbounded);
+                grid.occupied_share()
+            };
+            assert!(occupied(model.clone()) > 0.9);
+            for name in ["field.table", "field.density.0.weight", "field.density.1.weight"] {
+                let id = model.params.find(name).unwrap();
+                let value = if name.contains(".1.") { -1.0 } else { 1.0 };
+                model.params.get_mut(id).as_mut_slice().fill(value);
+            }
+            assert_eq!(occupied(model), 0.0);
+        }
+    }
+
     #[test]
     fn weights_are_padded_with_mean_embedding() {
         let config = small();

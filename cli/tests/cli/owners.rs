@@ -143,5 +143,6 @@ fn eval_stops_if_its_folder_is_taken_over() {
         let output = ended(child);
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(output.status.code() == Some(1) && said.contains("another raygrad evaluates there now"), "{said}");
+        assert!(!place.path("run/eval-test-f64.json").exists(), "nothing was written");
     }
 }
