@@ -2,6 +2,7 @@
 
 use super::Place;
 use super::SMALL;
+use raygrad::nerf::dataset::Split;
 use raygrad_test_support::skip::skipped;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
@@ -213,4 +214,27 @@ fn exit_codes_equal_the_help() {
         assert!(help.contains(&format!("\n  {line}")), "{line}: {help}");
     }
     assert!(include_str!("../../../docs/reference/exit-codes.md").contains("\n| 130 | interrupted"));
+}
+
+/// More than 16 images, of which each has some rays in a step.
+#[test]
+fn check_of_poses_is_told_once_and_recorded() {
+    let place = Place::with_scene();
+    let mut transforms = place.transforms(Split::Train);
+    let frames: Vec<Value> = vec![transforms["frames"].as_array().unwrap().clone(); 3].concat();
+    transforms["frames"] = json!(frames);
+    place.write_transforms(Split::Train, &transforms);
+    let told = |arguments: &str| {
+        let output = place.command(arguments).output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        String::from_utf8(output.stderr).unwrap().matches("poses    moved images by ").count()
+    };
+    assert_eq!(told(&format!("train scene --steps 130 --refine poses --out run {SMALL}")), 1);
+    let summary = place.json("run/summary.json")["pose_motion"].clone();
+    assert!(summary["median"].as_f64().unwrap() > 0.0 && summary["largest"].as_f64() >= summary["median"].as_f64());
+    let metrics = String::from_utf8(place.bytes("run/metrics.jsonl")).unwrap();
+    let last: Value = serde_json::from_str(metrics.lines().next_back().unwrap()).unwrap();
+    assert_eq!(last["pose_motion"], summary);
+    assert_eq!(told("train --resume run --steps 131"), 0);
+    assert_eq!(place.json("run/summary.json")["pose_motion"], summary);
 }

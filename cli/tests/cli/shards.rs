@@ -424,6 +424,10 @@ fn eval_shard_of_another_job_is_refused() {
     place.write_transforms(Split::Test, &moved);
     refused("eval run --shard 2/2", "`images` is ");
     place.write_transforms(Split::Test, &transforms);
+    let config = place.bytes("run/config.json");
+    std::fs::write(place.path("run/config.json"), [&config[..], b"\n"].concat()).unwrap();
+    refused("eval run --shard 2/2", "`config` is \"");
+    std::fs::write(place.path("run/config.json"), config).unwrap();
     let lock = File::create(place.path("run/eval-test/unfinished.lock")).unwrap();
     lock.lock().unwrap();
     place.fails("eval run --shard 2/2", &["another raygrad writes or merges all results there"]);
