@@ -246,5 +246,17 @@ mod tests {
             Measured::new(&capture.views[0], folder.path(), &analysis).unwrap().bytes
         };
         assert_eq!([bytes("rgb.png", 3), bytes("rgba.png", 4)], [72.0, 96.0]);
+        // All training images share the memory: 999 and 1001 of 3 MB.
+        let large = Image::new(1000, 1000, 3);
+        large.save_png(folder.path().join("large.png")).unwrap();
+        let many = |count: usize| {
+            let view = |i: usize| View {
+                image: Some(folder.path().join("large.png")),
+                split: Some(Split::Train),
+                ..View::new(format!("{i}"), format!("{i}"), Camera::from_angle(1000, 1000, 0.8, pose(i)))
+            };
+            of(folder.path(), (0..count).map(view).collect(), f64::INFINITY)
+        };
+        assert_eq!([many(999), many(1001)], [1, 2]);
     }
 }

@@ -335,6 +335,10 @@ mod tests {
         }
         let whole = sampler.resampled::<f64>(&shares, &weights, [10, 8], true, &mut Jitter::Middle);
         assert!(whole.chunks_exact(9).all(|edges| edges[0] == 0.0 && edges[8] == 1.0));
+        // Two samples in a quarter of the weight, and six in three quarters.
+        (weights[3], weights[7]) = (0.25, 0.75);
+        let found = sampler.resampled::<f64>(&shares, &weights, [10, 8], false, &mut Jitter::Middle);
+        assert_eq!(found[..9].iter().filter(|edge| **edge < 0.5).count(), 2, "{found:?}");
         // An exponent of 0 ignores the weights: the bins are uniform.
         let sampler = Proposal { trust: 0.0, ..sampler };
         let even = sampler.resampled::<f64>(&shares, &[0.25; 20], [10, 4], true, &mut Jitter::Middle);

@@ -7,7 +7,7 @@ use crate::dataset::{
 };
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, InstantConfig};
-use crate::model::RefinedParam;
+use crate::model::{PoseMotion, RefinedParam};
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
@@ -214,6 +214,15 @@ fn poses_that_hardly_move_are_restored() {
 }
 
 #[test]
+fn poses_are_right_if_no_image_moves_far() {
+    for (median, largest, right) in [(0.39, 0.84, true), (0.39, 0.86, false), (0.41, 0.5, false)] {
+        let stats = StepStats { pose_motion: Some(PoseMotion { median, largest }), ..StepStats::default() };
+        assert_eq!(stats.given_poses_are_right(), right, "{median} {largest}");
+    }
+    assert!(!StepStats::default().given_poses_are_right());
+}
+
+#[test]
 fn poses_are_checked_after_steps_of_the_model() {
     let mut trainer = refining(&[RefinedParam::Poses], 98, 0.0);
     assert_eq!(trainer.step(0.5).pose_motion, None);
@@ -223,6 +232,10 @@ fn poses_are_checked_after_steps_of_the_model() {
     let mut trainer = refining(&[RefinedParam::Focal, RefinedParam::Poses], 100, 0.0);
     trainer.model.config.camera_optimizer.check_at = 0.0;
     assert_eq!(trainer.step(0.5).pose_motion, None);
+    // Many images have few rays each.
+    let mut trainer = refining(&[RefinedParam::Poses], 100, 0.0);
+    trainer.done.rays = 100 * trainer.data.frames.len() as u64 - 1;
+    assert_eq!([trainer.step(0.5), trainer.step(0.5)].map(|stats| stats.pose_motion.is_some()), [false, true]);
 }
 
 #[test]
