@@ -357,6 +357,8 @@ fn eval_in_shards_equals_the_whole() {
     place.succeeds("--threads 2 eval run");
     let whole = result(&place);
     assert!(whole.1.len() > 11, "an image beside the evenly spaced ones");
+    // A network of 16 samples, and one of these and 16 more.
+    assert_eq!(whole.0["unskipped_per_pixel"], json!(48.0));
     let remove = || {
         std::fs::remove_file(place.path("run/eval-test.json")).unwrap();
         std::fs::remove_dir_all(place.path("run/eval-test")).unwrap();

@@ -557,7 +557,9 @@ fn view_opens_the_browser() {
         let text = std::fs::read_to_string(page).unwrap();
         assert!(text.contains(&format!("url={}\"", server.link())), "{text}");
         assert_eq!(std::fs::metadata(page).unwrap().permissions().mode() & 0o777, 0o600);
-        // It is removed when a page has connected.
+        // It stays, as a browser may be slow, and is removed when a page has connected.
+        std::thread::sleep(Duration::from_millis(1500));
+        assert!(page.exists());
         let (_page, _) = Page::open(&server);
         let start = Instant::now();
         while page.exists() {
