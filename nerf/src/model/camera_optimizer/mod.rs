@@ -244,7 +244,8 @@ impl CameraOptimizer {
         // In preconditioned parameters, the squared length of a row is an image's mean squared motion.
         let motion = |row: &[T]| row.iter().map(|x| x.to_f64().powi(2)).sum::<f64>().sqrt().to_degrees();
         let each: Vec<f64> = params.get(self.poses?).as_slice().chunks_exact(POSE).map(motion).collect();
-        let largest = each.iter().copied().fold(0.0, f64::max);
+        // NaN is the largest, so that no check passes it.
+        let largest = each.iter().copied().max_by(f64::total_cmp).unwrap_or(0.0);
         Some(PoseMotion { median: median(each), largest })
     }
 

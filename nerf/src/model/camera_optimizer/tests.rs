@@ -192,6 +192,8 @@ fn pose_motion_is_that_of_the_images() {
     }
     let PoseMotion { median, largest } = refine.pose_motion(&params).unwrap();
     assert!((0.9..1.1).contains(&(4.0 * median)) && (0.9..1.1).contains(&(largest / 0.75)), "{median} {largest}");
+    params.get_mut(id).as_mut_slice()[3 * POSE] = f64::NAN;
+    assert!(refine.pose_motion(&params).unwrap().largest.is_nan());
     refine.reset_poses(&mut params);
     assert!(refine.pose_motion(&params) == none && refine.camera(&params, 4, &cameras[4]) == cameras[4]);
     let params = &mut Params::<f64>::new();
