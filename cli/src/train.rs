@@ -143,10 +143,10 @@ pub struct Args {
     /// model learns that nothing is there. Every image needs a mask or transparency.
     #[arg(long, help_heading = "Scene")]
     mask_as_alpha: bool,
-    /// Background: white, black or random
+    /// Background: white, black, random or expected
     ///
     /// Lies behind transparent images, and behind opaque ones too if given. The default for transparent images is
-    /// random with instant and voxel, and white with small and classic.
+    /// expected with instant and voxel, and white with small and classic.
     #[arg(long, help_heading = "Scene", value_name = "COLOR", value_parser = parse::word::<Background>)]
     background: Option<Background>,
     /// Refine poses,focal,lens,exposure,vignetting

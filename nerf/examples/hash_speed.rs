@@ -63,7 +63,7 @@ fn measure(config: &HashGridConfig, name: &str, position: fn(usize, usize) -> f6
         (positions, Tensor::from_fn(&[TILE, grid.width()], |i| unit(t * TILE + i) as f32 - 0.5))
     };
     let tiles: Vec<_> = (0..TILES).map(tile).collect();
-    let encoding = HashEncoding(grid.clone());
+    let encoding = HashEncoding::new(grid.clone());
     let encode = each_tile(|t| {
         std::hint::black_box(encoding.forward(&[&tiles[t].0, &table], &pool));
     });
@@ -80,7 +80,7 @@ fn measure(config: &HashGridConfig, name: &str, position: fn(usize, usize) -> f6
         for run in 0..RUNS {
             let start = Instant::now();
             for (positions, d_out) in &tiles {
-                grid.scatter_level(l, positions.as_slice(), d_out.as_slice(), &mut sums);
+                grid.scatter_level(l, positions.as_slice(), d_out.as_slice(), 0.0, &mut sums);
             }
             let scattered = start.elapsed();
             let rows = Tensor::from_vec(&[sums.rows().len(), shape[1]], sums.sums().to_vec());

@@ -43,6 +43,7 @@ fn lazy_table_step_allocates_nothing() {
         grid: grid.clone(),
         positions: Tensor::from_fn(&[300, 3], |i| (i as f32 * 0.618).fract()),
         d_out: Tensor::from_fn(&[300, grid.width()], |i| (i as f32 * 0.377).fract() - 0.5),
+        cuts: vec![0.0; grid.levels().len()],
     });
     let mut gradient = Gradient::zero(grid.shape());
     gradient.add_sparse(tile.clone());

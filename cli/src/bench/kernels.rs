@@ -301,7 +301,7 @@ fn hash_grids(rounds: usize, quick: bool, results: &mut Results) -> Result<()> {
     for &log2_table in sizes {
         let grid = HashGrid::new(&HashGridConfig { levels: 8, features: 4, log2_table, ..HashGridConfig::paper() })?;
         let rows = grid.init::<f32>(1);
-        let encoding = HashEncoding(grid.clone());
+        let encoding = HashEncoding::new(grid.clone());
         let run = |x: &Tensor<f32>| {
             black_box(encoding.forward(&[x, &rows], &pool));
         };

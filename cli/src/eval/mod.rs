@@ -428,7 +428,7 @@ fn check_seen(backbone: Backbone, data: &Dataset, appearance: Appearance) -> Res
 /// The background of compared images. Random backgrounds are for training only.
 fn shown_background(trained: Background) -> Background {
     match trained {
-        Background::Random => Background::White,
+        Background::Random | Background::Expected => Background::White,
         fixed => fixed,
     }
 }

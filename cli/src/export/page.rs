@@ -261,6 +261,7 @@ mod tests {
             color_depth: 1,
             direction_degree: 1,
             appearance_embedding_dim: 2,
+            gradient_cut: 0.0,
         }
     }
 

@@ -22,8 +22,8 @@ impl Args {
         if let Some(background) = self.background {
             config.background = background;
         }
-        // Opaque images need no random background, unless a flag sets it.
-        if config.background == Background::Random && !data.has_alpha() && self.background.is_none() {
+        // Opaque images need no mean over backgrounds, unless a flag asks for it.
+        if config.background == Background::Expected && !data.has_alpha() && self.background.is_none() {
             config.background = Background::White;
         }
         if let Some(skip) = self.skip {

@@ -22,14 +22,18 @@ pub enum Background {
     /// A random colour for each training ray, so that no density can imitate the background. Rendered and evaluated
     /// images get white.
     Random,
+    /// The mean of the loss over all background colours: as `random`, without its noise. Only a squared error has this
+    /// closed form; with another loss colours are random.
+    Expected,
 }
 
 impl Background {
     /// Returns the colour behind a training ray. Only [`Random`](Self::Random) draws from `rng`: three uniform values,
-    /// 0 to 1.
+    /// 0 to 1. [`Expected`](Self::Expected) is their mean.
     pub fn draw(self, rng: &mut (impl Rng + ?Sized)) -> [f32; 3] {
         match self {
             Background::Random => rng.random(),
+            Background::Expected => [0.5; 3],
             fixed => fixed.shown(),
         }
     }
@@ -37,7 +41,7 @@ impl Background {
     /// Returns the colour behind images in output and evaluation.
     pub fn shown(self) -> [f32; 3] {
         match self {
-            Background::White | Background::Random => [1.0; 3],
+            Background::White | Background::Random | Background::Expected => [1.0; 3],
             Background::Black => [0.0; 3],
         }
     }
@@ -53,7 +57,8 @@ impl FromStr for Background {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self> {
-        by_name(text).ok_or_else(|| Error::setting("background", format!("is `{text}`; use white, black or random")))
+        by_name(text)
+            .ok_or_else(|| Error::setting("background", format!("is `{text}`; use white, black, random or expected")))
     }
 }
 
@@ -126,16 +131,17 @@ mod tests {
         assert_eq!(colour, untouched.random::<[f32; 3]>());
         assert_ne!(colour, Background::Random.draw(&mut rng));
         assert_eq!(Background::Random.shown(), [1.0; 3]);
+        assert_eq!((Background::Expected.draw(&mut rng), Background::Expected.shown()), ([0.5; 3], [1.0; 3]));
     }
 
     #[test]
     fn names_round_trip() {
-        for background in [Background::White, Background::Black, Background::Random] {
+        for background in [Background::White, Background::Black, Background::Random, Background::Expected] {
             assert_eq!(background.to_string().parse::<Background>().unwrap(), background);
             assert_eq!(serde_json::to_string(&background).unwrap(), format!("\"{background}\""));
         }
         let message = "grey".parse::<Background>().unwrap_err().to_string();
-        assert_eq!(message, "`background`: is `grey`; use white, black or random");
+        assert_eq!(message, "`background`: is `grey`; use white, black, random or expected");
     }
 
     proptest! {

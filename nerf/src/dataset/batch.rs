@@ -24,6 +24,8 @@ pub struct Batch {
     pub target: Vec<[f32; 3]>,
     /// Background of each ray, `[rays, 3]`.
     pub background: Vec<[f32; 3]>,
+    /// Alpha of each pixel, `[rays]`; 1 in images without.
+    pub alpha: Vec<f32>,
 }
 
 impl Batch {
@@ -53,8 +55,10 @@ impl Batch {
             batch.off_axis.push(frame.camera.off_axis(pixel) as f32);
             let distance = frame.distances.as_ref().map_or(0.0, |image| image.pixel(pixel[0], pixel[1])[0]);
             batch.distances.push(distance);
-            batch.target.push(over(&frame.image.pixel(pixel[0], pixel[1]), color));
+            let shown = frame.image.pixel(pixel[0], pixel[1]);
+            batch.target.push(over(&shown, color));
             batch.background.push(color);
+            batch.alpha.push(shown.get(3).copied().unwrap_or(1.0));
         }
         batch
     }
@@ -148,6 +152,26 @@ mod tests {
         let counts: Vec<usize> = (0..3).flat_map(|number| counts(&data, &batch, number)).collect();
         let used: Vec<usize> = counts.into_iter().filter(|count| *count > 0).collect();
         assert!(used.len() == 40 && used.iter().all(|count| (880..1120).contains(count)), "{used:?}");
+    }
+
+    #[test]
+    fn targets_and_alpha_are_those_of_the_pixel() {
+        let mut data = ball(Split::Val, 4);
+        let [width, height] = [5, 3];
+        let texel = |i: usize| (i % 17) as f32 / 17.0;
+        for (frame, channels) in data.frames.iter_mut().zip([3, 4, 4]) {
+            let values = (0..channels * width * height).map(texel).collect();
+            frame.camera = frame.camera.resized(width, height);
+            frame.image = Image { width, height, channels, data: values }.into();
+        }
+        data.frames.truncate(3);
+        let grey = Batch::draw(&data, 60, data.bounds, Background::Expected, &mut StdRng::seed_from_u64(3));
+        for (i, (frame, [x, y])) in grey.frames.iter().zip(&grey.pixels).enumerate() {
+            let pixel = data.frames[*frame as usize].image.pixel(*x as usize, *y as usize);
+            assert_eq!(grey.alpha[i], if pixel.len() == 4 { pixel[3] } else { 1.0 });
+            assert_eq!((grey.background[i], grey.target[i]), ([0.5; 3], over(&pixel, [0.5; 3])));
+        }
+        assert!(grey.alpha.iter().any(|alpha| *alpha < 1.0) && grey.alpha.contains(&1.0));
     }
 
     #[test]

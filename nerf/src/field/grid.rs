@@ -21,6 +21,7 @@ pub struct Grid {
     space: Space,
     /// The weight of each level; `None` if all are 1.
     weights: Option<Arc<[f64]>>,
+    gradient_cut: f64,
 }
 
 impl Grid {
@@ -33,7 +34,7 @@ impl Grid {
         let name = format!("{}.table", site.name);
         let table = site.params.add(name.clone(), grid.init(site.rng.random()));
         site.params.set_lazy(|other| other == name, true);
-        Ok(Grid { grid, table, space: site.space, weights: None })
+        Ok(Grid { grid, table, space: site.space, weights: None, gradient_cut: 0.0 })
     }
 
     /// Returns the grid with a share of its levels enabled, 0 to 1, the coarsest first: see [`detail_weights`].
@@ -41,6 +42,12 @@ impl Grid {
     pub fn with_detail(&self, detail: f64) -> Self {
         let weights = detail_weights(detail, self.grid.levels().len(), FIRST_LEVELS).map(Into::into);
         Grid { weights, ..self.clone() }
+    }
+
+    /// Returns the grid with this [gradient cut](HashEncoding::with_gradient_cut), initially 0.
+    #[must_use]
+    pub fn with_gradient_cut(self, gradient_cut: f64) -> Self {
+        Grid { gradient_cut, ..self }
     }
 
     /// Returns the number of channels of an encoding.
@@ -67,7 +74,8 @@ impl Grid {
     #[track_caller]
     pub fn encode<'t, T: Scalar>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
         let tape = positions.tape();
-        let features = tape.apply(HashEncoding(self.grid.clone()), &[&self.space.cube(positions), &params[self.table]]);
+        let encoding = HashEncoding::new(self.grid.clone()).with_gradient_cut(self.gradient_cut);
+        let features = tape.apply(encoding, &[&self.space.cube(positions), &params[self.table]]);
         let Some(weights) = &self.weights else { return features };
         let each = self.grid.features();
         features * tape.constant(Tensor::from_fn(&[self.width()], |i| T::from_f64(weights[i / each])))

@@ -34,6 +34,11 @@ pub struct InstantConfig {
     #[serde(default)]
     #[serde(alias = "codes")]
     pub appearance_embedding_dim: usize,
+    /// Gradient cut of the hash grid: samples whose gradient on a level is at most this share of its root mean square
+    /// do not change the table. At most this share of a level's gradient is dropped, in the Euclidean norm. Training
+    /// steps become faster. 0 drops nothing. Range: 0 to 1.
+    #[serde(default)]
+    pub gradient_cut: f64,
 }
 
 impl ComponentConfig<Fields> for InstantConfig {
@@ -45,7 +50,8 @@ impl ComponentConfig<Fields> for InstantConfig {
         check_range("color_width", self.color_width, 1, 1 << 12)?;
         check_range("color_depth", self.color_depth, 1, 64)?;
         check_range("direction_degree", self.direction_degree, 1, 4)?;
-        check_range("appearance_embedding_dim", self.appearance_embedding_dim, 0, 256)
+        check_range("appearance_embedding_dim", self.appearance_embedding_dim, 0, 256)?;
+        check_range("gradient_cut", self.gradient_cut, 0.0, 1.0)
     }
 
     fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn Field<T>>> {
@@ -76,7 +82,8 @@ impl Instant {
         let InstantConfig {
             density_width, features, color_width, color_depth, appearance_embedding_dim: codes, ..
         } = *config;
-        let density = DensityNetwork::new(&config.grid, density_width, features, site.child(site.name))?;
+        let mut density = DensityNetwork::new(&config.grid, density_width, features, site.child(site.name))?;
+        density.grid = density.grid.with_gradient_cut(config.gradient_cut);
         let BuildContext { frames, params, name, rng, .. } = site;
         let direction = SphericalHarmonics::new(config.direction_degree);
         let mut color = Vec::with_capacity(color_depth + 1);

@@ -222,20 +222,29 @@ impl Config {
                     color_depth: 2,
                     direction_degree: 4,
                     appearance_embedding_dim: 0,
+                    gradient_cut: 0.03,
                 }),
                 sampler: SamplerConfig::new(MarchingConfig::default()),
                 schedule: Schedule::Linear { from: 2e-2, to: 0.0, warmup: 0.005 },
                 adam: AdamConfig { beta1: 0.9, beta2: 0.99, eps: 1e-15 },
-                background: Background::Random,
+                background: Background::Expected,
                 ..classic
             },
             Preset::Voxel => Config {
                 field: FieldConfig::new(VoxelConfig { resolution: 128, direction_degree: 2 }),
                 sampler: SamplerConfig::new(MarchingConfig::default()),
                 schedule: Schedule::Exponential { from: 5e-2, to: 5e-3, warmup: 0.0 },
-                background: Background::Random,
+                background: Background::Expected,
                 ..classic
             },
+        }
+    }
+
+    /// The background of training rays: [`background`](Self::background), if the loss allows it.
+    pub(crate) fn training_background(&self) -> Background {
+        match (self.background, self.loss) {
+            (Background::Expected, Loss::Huber { .. }) => Background::Random,
+            (background, _) => background,
         }
     }
 
@@ -244,10 +253,12 @@ impl Config {
     /// `samples` is [`Budget::samples`](crate::Budget::samples), `pixels_per_side` is
     /// [`Dataset::pixels_per_side`](crate::dataset::Dataset::pixels_per_side). [`HashGridConfig::cpu`] chooses the
     /// table's size and resolution. Beyond 200 million samples (100 seconds on two cores) steps along a ray shrink
-    /// during training, down to a pixel's footprint. Beyond 600 million a training step has twice as many samples.
+    /// during training, down to a pixel's footprint. Beyond 600 million a training step has twice as many samples. Up to
+    /// there the colour network has one hidden layer.
     pub fn for_budget(mut self, samples: f64, pixels_per_side: f64) -> Self {
         if let Some(field) = self.field.get_mut::<InstantConfig>() {
             field.grid = HashGridConfig::cpu(samples, pixels_per_side);
+            field.color_depth = if samples > 6e8 { 2 } else { 1 };
             if let Some(marching) = self.sampler.get_mut::<MarchingConfig>()
                 && samples > 2e8
             {
@@ -479,15 +490,15 @@ mod tests {
         let made = |samples: f64, pixels_per_side: f64| {
             let config = Config::preset(Preset::Instant).for_budget(samples, pixels_per_side);
             config.check().unwrap();
-            let grid = &config.field.get::<InstantConfig>().unwrap().grid;
+            let InstantConfig { grid, color_depth, .. } = config.field.get::<InstantConfig>().unwrap();
             let marching = config.sampler.get::<MarchingConfig>().unwrap();
-            (grid.log2_table, grid.finest, marching.samples, marching.last_step)
+            (grid.log2_table, grid.finest, *color_depth, marching.samples, marching.last_step)
         };
         let samples = MarchingConfig::default().samples;
-        assert_eq!(made(2e8, 400.0), (17, 512, samples, None));
-        assert_eq!(made(2.5e8, 400.0), (18, 512, samples, Some(1.0 / 400.0)));
-        assert_eq!(made(6.5e8, 1000.0), (19, 768, 2 * samples, Some(1.0 / 450.0)));
-        assert_eq!(made(6.5e8, 100.0), (19, 200, 2 * samples, Some(1.0 / 150.0)));
+        assert_eq!(made(2e8, 400.0), (17, 512, 1, samples, None));
+        assert_eq!(made(2.5e8, 400.0), (18, 512, 1, samples, Some(1.0 / 400.0)));
+        assert_eq!(made(6.5e8, 1000.0), (19, 768, 2, 2 * samples, Some(1.0 / 450.0)));
+        assert_eq!(made(6.5e8, 100.0), (19, 200, 2, 2 * samples, Some(1.0 / 150.0)));
         // Presets without a grid do not change.
         assert_eq!(Config::preset(Preset::Classic).for_budget(1e9, 50.0), Config::preset(Preset::Classic));
     }
@@ -519,6 +530,7 @@ mod tests {
             [&preset, &unbounded].map(|config| config.sampler.get::<MarchingConfig>().unwrap().clone());
         assert_eq!((after.occupancy.cascades, after.occupancy.resolution, after.samples), (6, 32, 4 * before.samples));
         assert_eq!((after.step, after.last_step, after.cone, after.view_step), (0.01, None, 1.0 / 64.0, 1.0 / 150.0));
+        assert_eq!((before.early_stop_eps, after.early_stop_eps), (0.01, 0.001));
         let [coarse, fine] =
             [&preset, &unbounded].map(|config| config.field.get::<InstantConfig>().unwrap().grid.finest);
         assert_eq!(fine, 2 * coarse);

@@ -1,5 +1,6 @@
 //! The forward pass of a tile of a training step: from rays to a loss.
 
+use crate::dataset::Background;
 use crate::dataset::batch::Batch;
 use crate::losses::LossInputs;
 use crate::losses::interlevel::interlevel;
@@ -79,13 +80,26 @@ pub(crate) fn rays_loss<'t>(
         None => seen.over(&background),
     };
     let color = shown(&rendered);
-    let fine = model.config.loss.sum(&color, &target);
+    let is_expected = model.config.training_background() == Background::Expected;
+    let behind: Vec<f32> = batch.alpha.iter().map(|alpha| 1.0 - alpha).collect();
+    let photometric = |seen: &Rendered<'t, f32>, color: &Var<'t, f32>| {
+        let loss = model.config.loss.sum(color, &target);
+        // A colour's error is linear in the background `b`: `e + d b`, with `d` the error of the transmittance. Its mean
+        // square over `b` in 0 to 1 is `(e + d / 2)^2 + d^2 / 12`; the first term is the error over grey.
+        if is_expected {
+            let missed = seen.transmittance() - tape.constant(tape.pool().copy_of(&[behind.len()], &behind));
+            loss + missed.square().sum() * (3.0 / 12.0)
+        } else {
+            loss
+        }
+    };
+    let fine = photometric(&rendered, &color);
     let error = match model.config.loss {
-        Loss::Mse => fine.item(),
-        // PSNR needs squared errors, for any loss.
+        Loss::Mse if !is_expected => fine.item(),
+        // PSNR needs squared errors of colours, for any loss.
         _ => tape.no_grad(|| Loss::Mse.sum(&color, &target).item()),
     };
-    let coarse = coarse.iter().map(|seen| model.config.loss.sum(&shown(seen), &target));
+    let coarse = coarse.iter().map(|seen| photometric(seen, &shown(seen)));
     let weights = rendered.weights.value();
     let levels = levels.iter().map(|level| interlevel(level, &rendered.samples, weights));
     let (frames, pixels, distances) = (&batch.frames[..], &batch.pixels[..], &batch.distances[..]);

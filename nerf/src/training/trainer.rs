@@ -75,7 +75,7 @@ impl Draw<'_> {
         let Draw { model, data, seed, number, fraction, total, tile } = *self;
         let rng = &mut stream(seed, [number, which as u64]);
         let count = tile.min(total - which * tile);
-        let batch = Batch::draw(data, count, model.reach(), model.config.background, rng);
+        let batch = Batch::draw(data, count, model.reach(), model.config.training_background(), rng);
         let (loss, work) = rays_loss(model, params, &batch, fraction, &mut Jitter::Random(rng));
         (loss * (1.0 / (3.0 * total as f64)), work)
     }

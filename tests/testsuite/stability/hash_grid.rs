@@ -18,7 +18,7 @@ fn along<T: Scalar>(grid: &HashGrid, table: &Tensor<T>, axis: usize, x: &[f64]) 
         .flat_map(|&x| std::array::from_fn::<_, 3, _>(|k| if k == axis { x } else { 0.3 + 0.1 * k as f64 }))
         .collect();
     let points = tape.leaf(tensor::<T>(&[x.len(), 3], &points));
-    let y = tape.apply(HashEncoding(grid.clone()), &[&points, &tape.constant(table.clone())]).slice_axis(1, ..1);
+    let y = tape.apply(HashEncoding::new(grid.clone()), &[&points, &tape.constant(table.clone())]).slice_axis(1, ..1);
     let slopes = y.sum().grad(&[&points]).remove(0);
     [numbers(y.value()), numbers(&slopes).chunks_exact(3).map(|row| row[axis]).collect()]
 }

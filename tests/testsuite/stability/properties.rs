@@ -169,7 +169,7 @@ fn grid_cells<T: Scalar>(points: &[[f64; 3]]) -> Outcome {
     let tape = Tape::new();
     let x = tape.leaf(tensor::<T>(&[points.len(), 3], points.as_flattened()));
     let table = tape.leaf(Tensor::ones(grid.shape()));
-    let y = tape.apply(HashEncoding(grid.clone()), &[&x, &table]);
+    let y = tape.apply(HashEncoding::new(grid.clone()), &[&x, &table]);
     for (row, point) in numbers(y.value()).chunks_exact(4).zip(points) {
         let bad = point.iter().any(|x| x.is_nan());
         prop_assert!(

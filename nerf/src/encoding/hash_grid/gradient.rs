@@ -12,6 +12,8 @@ pub struct HashGrad<T: Scalar> {
     pub positions: Tensor<T>,
     /// Gradient of the encoding, `[samples, width]`.
     pub d_out: Tensor<T>,
+    /// For each level, the largest gradient that [is dropped](super::HashEncoding::with_gradient_cut).
+    pub cuts: Vec<T>,
 }
 
 impl<T: Scalar> SparseGrad<T> for HashGrad<T> {
@@ -40,7 +42,7 @@ impl<T: Scalar> RowShare<T> for HashGrad<T> {
         );
         for (number, level) in self.grid.levels().iter().enumerate() {
             let mut part = RowSums::new(level.rows.len(), features);
-            self.grid.scatter_level(number, self.positions.as_slice(), self.d_out.as_slice(), &mut part);
+            self.scatter_part(number, &mut part);
             for (&row, sum) in part.rows().iter().zip(part.sums().chunks_exact(features)) {
                 sums.add(level.rows.start + row as usize, sum);
             }
@@ -52,6 +54,6 @@ impl<T: Scalar> RowShare<T> for HashGrad<T> {
     }
 
     fn scatter_part(&self, part: usize, sums: &mut RowSums<T>) {
-        self.grid.scatter_level(part, self.positions.as_slice(), self.d_out.as_slice(), sums);
+        self.grid.scatter_level(part, self.positions.as_slice(), self.d_out.as_slice(), self.cuts[part], sums);
     }
 }

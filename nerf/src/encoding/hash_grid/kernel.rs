@@ -135,13 +135,14 @@ impl<T: Scalar> Cells<T> {
     }
 
     /// The adjoint of [`gather`](Self::gather) in the table: adds each sample's gradient to the rows of its corners, in
-    /// the order of the samples. Samples with a zero gradient change nothing.
+    /// the order of the samples. Samples whose gradients are all at most `cut` in magnitude change nothing.
     #[inline(always)]
     pub(super) fn scatter<const F: usize>(
         &self,
         d_out: &[T],
         width: usize,
         column: usize,
+        cut: T,
         grad: &mut RowAdder<'_, T, F>,
     ) {
         // Neighbouring samples of a ray often share a cell, above all on coarse levels. Their gradients are summed
@@ -150,7 +151,12 @@ impl<T: Scalar> Cells<T> {
         for (i, d_out) in d_out.chunks_exact(width).enumerate().take(self.len) {
             let mut g = [T::ZERO; F];
             g.copy_from_slice(&d_out[column..column + F]);
-            if g == [T::ZERO; F] {
+            // NaN is not small.
+            let mut is_small = true;
+            for f in 0..F {
+                is_small &= g[f].abs() <= cut;
+            }
+            if is_small {
                 continue;
             }
             let same = cell.is_some_and(

@@ -12,7 +12,7 @@ fn grid(levels: usize, features: usize, log2_table: u32, coarsest: usize, finest
 
 fn encode<T: Scalar>(grid: &HashGrid, positions: &[f64], table: &Tensor<T>) -> Vec<f64> {
     let positions = Tensor::from_vec(&[positions.len() / 3, 3], positions.iter().map(|&x| T::from_f64(x)).collect());
-    let out = HashEncoding(grid.clone()).forward(&[&positions, table], &Pool::none());
+    let out = HashEncoding::new(grid.clone()).forward(&[&positions, table], &Pool::none());
     out.as_slice().iter().map(|x| x.to_f64()).collect()
 }
 
@@ -154,7 +154,7 @@ fn rows_stay_in_bounds() {
             let ones = vec![1.0_f32; positions.len() / 3 * grid.width()];
             let positions: Vec<f32> = positions.iter().map(|&x| x as f32).collect();
             for (l, level) in grid.levels().iter().enumerate() {
-                grid.scatter_level(l, &positions, &ones, &mut RowSums::new(level.rows.len(), 2));
+                grid.scatter_level(l, &positions, &ones, 0.0, &mut RowSums::new(level.rows.len(), 2));
             }
         }
     }
@@ -186,7 +186,7 @@ fn hash_encoding_outside_the_cube_has_no_gradient() {
     let tape = Tape::new();
     let x = tape.leaf(Tensor::from_vec(&[1, 3], vec![-1e-9, 0.3, 1.5]));
     let table = tape.leaf(table);
-    let [dx, _] = tape.apply(HashEncoding(grid), &[&x, &table]).sum().grad(&[&x, &table]).try_into().unwrap();
+    let [dx, _] = tape.apply(HashEncoding::new(grid), &[&x, &table]).sum().grad(&[&x, &table]).try_into().unwrap();
     assert!(dx.as_slice()[0] == 0.0 && dx.as_slice()[2] == 0.0 && dx.as_slice()[1] != 0.0);
 }
 
@@ -201,7 +201,7 @@ proptest! {
         let mut backward = 0.0;
         for (l, level) in grid.levels().iter().enumerate() {
             let mut sums = RowSums::new(level.rows.len(), 2);
-            grid.scatter_level(l, &positions, &d_out, &mut sums);
+            grid.scatter_level(l, &positions, &d_out, 0.0, &mut sums);
             for (&row, sum) in sums.rows().iter().zip(sums.sums().chunks(2)) {
                 let values = &table.as_slice()[(level.rows.start + row as usize) * 2..];
                 backward += sum[0] * values[0] + sum[1] * values[1];
@@ -217,12 +217,84 @@ fn zero_gradient_updates_no_row() {
     let positions = units(3 * 20, 5);
     let mut d_out = units(20 * grid.width(), 6);
     let mut sums = RowSums::new(grid.levels()[1].rows.len(), 4);
-    grid.scatter_level(1, &positions, &d_out, &mut sums);
+    grid.scatter_level(1, &positions, &d_out, 0.0, &mut sums);
     assert!((8..=160).contains(&sums.rows().len()) && sums.sums().iter().all(|&sum| sum != 0.0));
     sums.clear();
     d_out.fill(0.0);
-    grid.scatter_level(1, &positions, &d_out, &mut sums);
+    grid.scatter_level(1, &positions, &d_out, 0.0, &mut sums);
     assert!(sums.rows().is_empty());
+}
+
+/// The gradient of the table, as a dense tensor, of an encoding with this gradient cut.
+fn table_gradient(grid: &HashGrid, positions: &[f64], d_out: &[f32], cut: f64) -> Vec<f32> {
+    let (tape, positions) = (Tape::new(), positions.iter().map(|&x| x as f32).collect());
+    let (table, samples) = (tape.leaf(grid.init::<f32>(1)), d_out.len() / grid.width());
+    let x = tape.constant(Tensor::from_vec(&[samples, 3], positions));
+    let out = tape.apply(HashEncoding::new(grid.clone()).with_gradient_cut(cut), &[&x, &table]);
+    // Linear in the output, and right where `d_out` is not finite.
+    let weights = tape.constant(Tensor::from_vec(&[samples, grid.width()], d_out.to_vec()));
+    (out * weights).sum().grad(&[&table]).remove(0).as_slice().to_vec()
+}
+
+#[test]
+fn gradient_cut_drops_small_gradients_of_each_level() {
+    let (grid, samples) = (grid(3, 2, 7, 4, 16), 100);
+    let (positions, width) = (units(3 * samples, 1), grid.width());
+    let (random, sizes) = (units(samples * width, 2), units(samples, 3));
+    // The second level has much smaller gradients, and half of the samples a thousandth of the others'. In a square they
+    // would leave the range.
+    let size = |i: usize| if sizes[i / width] < 0.5 { 1e-3 } else { 1.0 };
+    let level = |i: usize| if i % width / 2 == 1 { 1e-30 } else { 1.0 };
+    let d_out: Vec<f32> = random.iter().enumerate().map(|(i, x)| ((x + 0.1) * size(i) * level(i)) as f32).collect();
+    let large: Vec<f32> = d_out.iter().enumerate().map(|(i, x)| if size(i) < 1.0 { 0.0 } else { *x }).collect();
+    let gradient = |d_out: &[f32], cut: f64| table_gradient(&grid, &positions, d_out, cut);
+    assert_eq!(gradient(&d_out, 0.03), gradient(&large, 0.0));
+    assert_ne!(gradient(&d_out, 0.0), gradient(&large, 0.0));
+    assert_eq!(gradient(&d_out, 1e-5), gradient(&d_out, 0.0));
+    // One feature that is large keeps the sample on that level alone.
+    let mut one = d_out.clone();
+    let small = sizes.iter().position(|size| *size < 0.5).unwrap();
+    one[width * small + 5] = 1.0;
+    let mut kept = large.clone();
+    kept[width * small + 4..width * small + 6].copy_from_slice(&[one[width * small + 4], 1.0]);
+    assert_eq!(gradient(&one, 0.03), gradient(&kept, 0.0));
+}
+
+#[test]
+fn gradient_cut_bounds_what_is_dropped() {
+    let (grid, samples) = (grid(2, 4, 7, 4, 16), 500);
+    let width = grid.width();
+    for (seed, power) in [(1, 1), (2, 3), (3, 9)] {
+        let d_out: Vec<f32> = units(samples * width, seed).iter().map(|x| (2.0 * x - 1.0).powi(power) as f32).collect();
+        for share in [0.01, 0.1, 1.0] {
+            let encoding = HashEncoding::new(grid.clone()).with_gradient_cut(share);
+            for (level, cut) in encoding.cuts(&d_out).into_iter().enumerate() {
+                let rows = || d_out.chunks(width).map(|row| &row[4 * level..][..4]);
+                let norm = |rows: &mut dyn Iterator<Item = &[f32]>| {
+                    rows.flatten().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt()
+                };
+                let dropped = norm(&mut rows().filter(|row| row.iter().all(|x| x.abs() <= cut)));
+                let all = norm(&mut rows());
+                let expected = share * all / ((samples * 4) as f64).sqrt();
+                assert!((f64::from(cut) - expected).abs() <= 1e-6 * expected, "{cut} for {expected}");
+                assert!(dropped <= (1.0 + 1e-6) * share * all, "{dropped} of {all}");
+                assert!(share < 1.0 || dropped > 0.0);
+            }
+        }
+    }
+}
+
+#[test]
+fn gradient_cut_never_hides_what_is_not_finite() {
+    let grid = grid(2, 2, 7, 4, 16);
+    let (positions, mut d_out) = (units(30, 1), vec![1.0_f32; 10 * grid.width()]);
+    for wrong in [f32::NAN, f32::INFINITY] {
+        d_out[0] = wrong;
+        let gradient = table_gradient(&grid, &positions, &d_out, 0.5);
+        assert_eq!(format!("{gradient:?}"), format!("{:?}", table_gradient(&grid, &positions, &d_out, 0.0)));
+        assert!(gradient.iter().any(|x| !x.is_finite()) && gradient.iter().filter(|x| **x != 0.0).count() > 32);
+    }
+    assert!(table_gradient(&grid, &[], &[], 0.5).iter().all(|x| *x == 0.0));
 }
 
 fn tiles(grid: &HashGrid, count: usize) -> Vec<Arc<HashGrad<f32>>> {
@@ -236,6 +308,7 @@ fn tiles(grid: &HashGrid, count: usize) -> Vec<Arc<HashGrad<f32>>> {
                 grid: grid.clone(),
                 positions: tensor(&[90, 3], t),
                 d_out: tensor(&[90, grid.width()], 100 + t),
+                cuts: vec![0.0; grid.levels().len()],
             })
         })
         .collect()
@@ -277,7 +350,7 @@ fn sparse_hash_update_equals_dense_update() {
     for tile in &tiles {
         let tape = Tape::new();
         let table = tape.leaf(start.clone());
-        let out = tape.apply(HashEncoding(grid.clone()), &[&tape.constant(tile.positions.clone()), &table]);
+        let out = tape.apply(HashEncoding::new(grid.clone()), &[&tape.constant(tile.positions.clone()), &table]);
         let grad = (out * tape.constant(tile.d_out.clone())).sum().grad(&[&table]).remove(0);
         raygrad_tensor::add_assign(&mut dense, grad.as_slice());
     }

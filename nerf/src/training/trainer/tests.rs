@@ -2,11 +2,12 @@
 
 use super::*;
 use crate::dataset::{
-    Split,
+    Background, Split,
     sample::{ball, ball_ahead},
 };
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, InstantConfig};
+use crate::losses::Loss;
 use crate::model::{PoseMotion, RefinedParam};
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
@@ -81,7 +82,7 @@ fn forward_facing_fields_use_ndc() {
 fn step_stats_add_up_and_name_the_failing_step() {
     let mut data = ball(Split::Train, 8);
     data.frames.truncate(3);
-    let config = Config { background: crate::Background::White, ..tiny_table() };
+    let config = Config { background: Background::White, ..tiny_table() };
     let mut trainer = Trainer::new(config, Arc::new(data)).unwrap();
     let counts = |trainer: &mut Trainer| {
         trainer.step(0.0);
@@ -433,6 +434,75 @@ fn batch_size_follows_wanted_samples() {
     assert_eq!([next(1024, 1024), next(1024, 0)], [2048; 2]);
     assert_eq!(next(1500, 8 * 1500), 2288);
     assert_eq!(next(256, 10_000_000), 256);
+}
+
+#[test]
+fn expected_background_gives_the_mean_loss_over_all_backgrounds() {
+    let data = Arc::new(ball(Split::Train, 12));
+    for config in [tiny_table(), Config { background: Background::Expected, ..tiny() }] {
+        let mut trainer = Trainer::new(config, data.clone()).unwrap();
+        for _ in 0..20 {
+            trainer.step(0.0);
+        }
+        let reach = trainer.model.reach();
+        let mut batch = Batch::draw(&data, 64, reach, Background::Expected, &mut stream(1, [0, 0]));
+        let mut loss = |batch: &Batch| {
+            let (tape, model) = (Tape::new(), &trainer.model);
+            let params = model.params.bind(&tape);
+            let rng = &mut stream(2, [0, 0]);
+            let (loss, work) = rays_loss(model, &params, batch, 0.0, &mut Jitter::Random(rng));
+            let grads = loss.tracked().backward(&params.vars()).into_iter();
+            let grads: Vec<f32> = grads.flat_map(|grad| grad.into_dense(&Pool::none()).as_slice().to_vec()).collect();
+            trainer.model.config.background = Background::White;
+            (work.loss, work.error, grads)
+        };
+        let expected = loss(&batch);
+        assert!(expected.0 > expected.1, "the error is that over grey");
+        // Gauss-Legendre quadrature with two nodes is exact for squares.
+        let nodes = [0.5 - 12_f32.sqrt().recip(), 0.5 + 12_f32.sqrt().recip()].map(|color| {
+            for ((target, background), alpha) in batch.target.iter_mut().zip(&mut batch.background).zip(&batch.alpha) {
+                *target = target.map(|x| x + (1.0 - alpha) * (color - background[0]));
+                *background = [color; 3];
+            }
+            loss(&batch)
+        });
+        let mean = (nodes[0].0 + nodes[1].0) / 2.0;
+        assert!((expected.0 / mean - 1.0).abs() < 1e-5, "{} for {mean}", expected.0);
+        let largest = expected.2.iter().fold(0.0_f32, |most, x| most.max(x.abs()));
+        for ((found, a), b) in expected.2.iter().zip(&nodes[0].2).zip(&nodes[1].2) {
+            assert!((found - (a + b) / 2.0).abs() <= 1e-4 * largest, "{found} for {a} and {b}");
+        }
+    }
+}
+
+#[test]
+fn only_squared_errors_have_an_expected_background() {
+    let huber = Config { loss: Loss::Huber { delta: 0.1 }, ..tiny_table() };
+    let used = |config: &Config| config.training_background();
+    assert_eq!([used(&tiny_table()), used(&huber)], [Background::Expected, Background::Random]);
+    assert_eq!(used(&Config { background: Background::Black, ..huber }), Background::Black);
+}
+
+#[test]
+fn gradient_cut_moves_fewer_rows() {
+    let moved = [0.0, 0.03, 1.0].map(|cut| {
+        let mut config = tiny_table();
+        if let Some(field) = config.field.get_mut::<InstantConfig>() {
+            assert_eq!(field.gradient_cut, 0.03, "the preset's");
+            field.gradient_cut = cut;
+            // Most rows have one sample.
+            (field.grid.log2_table, field.grid.finest) = (18, 256);
+        }
+        let mut trainer = Trainer::new(config, Arc::new(ball(Split::Train, 12))).unwrap();
+        (0..10).map(|_| trainer.step(0.0)).last().unwrap().moved
+    });
+    assert!(moved[0] > moved[1] && moved[1] > moved[2] && moved[2] > 0, "{moved:?}");
+    let mut config = tiny_table();
+    if let Some(field) = config.field.get_mut::<InstantConfig>() {
+        field.gradient_cut = 1.5;
+    }
+    let message = config.check().unwrap_err().to_string();
+    assert!(message.contains("gradient_cut") && message.contains("1.5"), "{message}");
 }
 
 #[test]
