@@ -126,6 +126,7 @@ fn train(course: &Course, data: &Arc<Dataset>, test: &Dataset) -> Result<Vec<Poi
     let config = Config { seed: course.seed, ..Config::preset(course.preset) };
     let budget = Budget::Time(Duration::from_secs(course.seconds));
     let config = config.for_budget(budget.samples(), data.pixels_per_side()).with_skip(course.skip);
+    let config = config.with_transparency(data.has_alpha());
     let mut trainer = Trainer::new(config, data.clone())?;
     let measure = |trainer: &Trainer| {
         let background = trainer.model.config.background.shown();

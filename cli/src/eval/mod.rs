@@ -425,7 +425,7 @@ fn check_seen(backbone: Backbone, data: &Dataset, appearance: Appearance) -> Res
     Ok(())
 }
 
-/// The background of compared images. Random backgrounds are for training only.
+/// The background of compared images. Random and expected backgrounds are for training only.
 fn shown_background(trained: Background) -> Background {
     match trained {
         Background::Random | Background::Expected => Background::White,
@@ -439,6 +439,13 @@ mod tests {
     use raygrad::nerf::dataset::Mask;
     use raygrad_scenes::embedded;
     use std::sync::Arc;
+
+    #[test]
+    fn views_are_compared_over_fixed_backgrounds() {
+        let shown = [Background::White, Background::Black, Background::Random, Background::Expected];
+        let expected = [Background::White, Background::Black, Background::White, Background::White];
+        assert_eq!(shown.map(shown_background), expected);
+    }
 
     #[test]
     fn check_seen_small_or_masked_images_fail() {

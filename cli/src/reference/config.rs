@@ -559,7 +559,8 @@ fn page() -> String {
          Parts of a path are separated by points; `[]` stands for the elements of a list.",
         "Defaults are those of the presets; one value means that all presets have it. `raygrad train` adapts some to the \
          budget: the size of the hash grid, `color_depth`, `step`, `last_step` and `samples`. For unbounded scenes it also \
-         changes `cascades`, `resolution`, `cone`, `view_step` and `early_stop_eps`, and adds a distortion loss.",
+         changes `cascades`, `resolution`, `cone` and `view_step`, and adds a distortion loss. Transparent images of a bounded \
+         scene change `early_stop_eps`.",
         "This page is generated from the program. `UPDATE_SNAPSHOTS=1 cargo test -p raygrad-cli --bin raygrad reference` \
          writes it.",
     ] {

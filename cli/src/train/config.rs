@@ -6,7 +6,7 @@ use raygrad::nerf::dataset::{Dataset, SceneType};
 use raygrad::nerf::losses::DepthConfig;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
-use raygrad::nerf::{Background, Budget, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
+use raygrad::nerf::{Budget, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
 use serde_json::Value;
 
 use super::super::cameras::Viewpoint;
@@ -19,13 +19,6 @@ impl Args {
     pub fn config(&self, data: &Dataset) -> Result<Config> {
         let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
         config = config.for_budget(self.budget().samples(), data.pixels_per_side());
-        if let Some(background) = self.background {
-            config.background = background;
-        }
-        // Opaque images need no mean over backgrounds, unless a flag asks for it.
-        if config.background == Background::Expected && !data.has_alpha() && self.background.is_none() {
-            config.background = Background::White;
-        }
         if let Some(skip) = self.skip {
             config = config.with_skip(skip);
         }
@@ -35,6 +28,10 @@ impl Args {
             config = changed(&config, name, value)?;
         }
         config = config.with_scene_type(data.scene_type).with_images(data.frames.len());
+        config = config.with_transparency(data.has_alpha());
+        if let Some(background) = self.background {
+            config.background = background;
+        }
         if let Some(carve) = self.carve {
             let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
                 let what = format!("the preset {} has no occupancy grid to carve: add --skip fast", self.preset);

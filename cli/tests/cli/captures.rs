@@ -227,15 +227,19 @@ fn hash_grid_resolution_follows_the_images() {
 }
 
 #[test]
-fn opaque_images_have_plain_background() {
+fn background_follows_transparency() {
     let place = Place::empty();
     let background = |flag: &str, run: &str| {
         place.succeeds(&format!("train landscape --downscale 20 --steps 1 --out {run} {SMALL} {flag}"));
         place.json(&format!("{run}/config.json"))["config"]["background"].clone()
     };
     assert_eq!(background("", "usual"), "white");
-    assert_eq!(background("--background random", "random"), "random");
+    assert_eq!(background("--background expected", "expected"), "expected");
     assert_eq!(background("--background black", "black"), "black");
+    assert_eq!(place.json("usual/config.json")["config"]["sampler"]["early_stop_eps"], 0.001);
+    place.succeeds(&format!("train embedded --downscale 8 --steps 1 --out transparent {SMALL}"));
+    let config = place.json("transparent/config.json")["config"].clone();
+    assert_eq!((&config["background"], &config["sampler"]["early_stop_eps"]), (&json!("expected"), &json!(0.01)));
     // Samplers with uniform samples would miss an unbounded scene.
     place.fails_with(
         "train landscape --downscale 20 --steps 1 --preset small",

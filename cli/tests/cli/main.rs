@@ -796,7 +796,7 @@ fn bad_arguments_are_usage_errors() {
         ("train --downscale 0", "write a whole number from 1 to 16384"),
         ("train --threads 0", "write a whole number from 1 to 1024"),
         ("train --preset huge", "use classic, small, instant or voxel"),
-        ("train --background grey", "white, black or random"),
+        ("train --background grey", "white, black, random or expected"),
         ("train --refine all", "use poses, focal, lens, exposure or vignetting"),
         ("eval", "required arguments"),
         ("eval run --split all", "use train, val or test"),

@@ -23,7 +23,7 @@ pub enum Background {
     /// images get white.
     Random,
     /// The mean of the loss over all background colours: as `random`, without its noise. Only a squared error has this
-    /// closed form; with another loss colours are random.
+    /// closed form; with another loss, colours are random. Rendered and evaluated images get white.
     Expected,
 }
 

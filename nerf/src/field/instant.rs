@@ -34,9 +34,10 @@ pub struct InstantConfig {
     #[serde(default)]
     #[serde(alias = "codes")]
     pub appearance_embedding_dim: usize,
-    /// Gradient cut of the hash grid: samples whose gradient on a level is at most this share of its root mean square
-    /// do not change the table. At most this share of a level's gradient is dropped, in the Euclidean norm. Training
-    /// steps become faster. 0 drops nothing. Range: 0 to 1.
+    /// Gradient cut of the hash grid. Samples do not change a level of the table if the gradients of its features are at
+    /// most this share of their root mean square over a tile of a training step. Steps become faster, and slightly
+    /// biased: the dropped gradient of the features is at most this share, in the Euclidean norm. 0 drops nothing.
+    /// Range: 0 to 1.
     #[serde(default)]
     pub gradient_cut: f64,
 }

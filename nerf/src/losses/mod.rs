@@ -46,7 +46,8 @@ pub struct LossInputs<'a, 't, T: Scalar> {
     pub rendered: &'a Rendered<'t, T>,
     /// The images' colours, `[rays, 3]`, over the background where they have alpha.
     pub target: &'a Tensor<T>,
-    /// The background of each ray, `[rays, 3]`.
+    /// The background of each ray, `[rays, 3]`. It is grey for [`Background::Expected`](crate::Background::Expected): a
+    /// term that compares colours needs another one, such as `Random`.
     pub background: &'a Tensor<T>,
 }
 

@@ -44,6 +44,8 @@ const CHECK_AT: f64 = 0.05;
 /// The most images that count as few, and the share of a run over which detail is enabled then.
 const FEW_IMAGES: usize = 16;
 const FEW_IMAGES_COARSE: f64 = 0.5;
+/// Early termination of training on transparent images of a bounded scene.
+const TRANSPARENT_EARLY_STOP: f64 = 0.01;
 
 /// A named configuration, for [`Config::preset`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -248,13 +250,13 @@ impl Config {
         }
     }
 
-    /// Adapts the hash grid and the sampling to a training budget.
+    /// Adapts the hash grid, the colour network and the sampling to a training budget.
     ///
     /// `samples` is [`Budget::samples`](crate::Budget::samples), `pixels_per_side` is
     /// [`Dataset::pixels_per_side`](crate::dataset::Dataset::pixels_per_side). [`HashGridConfig::cpu`] chooses the
     /// table's size and resolution. Beyond 200 million samples (100 seconds on two cores) steps along a ray shrink
-    /// during training, down to a pixel's footprint. Beyond 600 million a training step has twice as many samples. Up to
-    /// there the colour network has one hidden layer.
+    /// during training, down to a pixel's footprint. Beyond 600 million a training step has twice as many samples, and the
+    /// colour network of an instant field two hidden layers instead of one.
     pub fn for_budget(mut self, samples: f64, pixels_per_side: f64) -> Self {
         if let Some(field) = self.field.get_mut::<InstantConfig>() {
             field.grid = HashGridConfig::cpu(samples, pixels_per_side);
@@ -301,6 +303,25 @@ impl Config {
         } else {
             self.loss_terms.retain(|term| term.get::<DistortionConfig>().is_none());
             field.into_iter().for_each(|field| field.grid.finest /= 2);
+        }
+        self
+    }
+
+    /// Adapts the configuration to images with or without transparent pixels. Call it after
+    /// [`with_scene_type`](Self::with_scene_type).
+    ///
+    /// An [expected](Background::Expected) background becomes white behind opaque images. Where a bounded scene has
+    /// transparent images, training ends rays at a transmittance of .01. Elsewhere some runs have fog for long, and ending
+    /// rays early keeps it. Figures are in docs/benchmarks/results.md, section Levers.
+    pub fn with_transparency(mut self, is_transparent: bool) -> Self {
+        if self.background == Background::Expected && !is_transparent {
+            self.background = Background::White;
+        }
+        if let Some(marching) = self.sampler.get_mut::<MarchingConfig>()
+            && is_transparent
+            && !self.unbounded
+        {
+            marching.early_stop_eps = TRANSPARENT_EARLY_STOP;
         }
         self
     }
@@ -496,11 +517,28 @@ mod tests {
         };
         let samples = MarchingConfig::default().samples;
         assert_eq!(made(2e8, 400.0), (17, 512, 1, samples, None));
-        assert_eq!(made(2.5e8, 400.0), (18, 512, 1, samples, Some(1.0 / 400.0)));
+        assert_eq!(made(6e8, 400.0), (18, 512, 1, samples, Some(1.0 / 400.0)));
         assert_eq!(made(6.5e8, 1000.0), (19, 768, 2, 2 * samples, Some(1.0 / 450.0)));
         assert_eq!(made(6.5e8, 100.0), (19, 200, 2, 2 * samples, Some(1.0 / 150.0)));
         // Presets without a grid do not change.
         assert_eq!(Config::preset(Preset::Classic).for_budget(1e9, 50.0), Config::preset(Preset::Classic));
+    }
+
+    #[test]
+    fn transparency_sets_background_and_end_of_rays() {
+        let preset = Config::preset(Preset::Instant);
+        let adapted = |config: &Config, is_transparent: bool| {
+            let config = config.clone().with_transparency(is_transparent);
+            config.check().unwrap();
+            (config.background, config.sampler.get::<MarchingConfig>().map(|marching| marching.early_stop_eps))
+        };
+        assert_eq!(adapted(&preset, true), (Background::Expected, Some(0.01)));
+        assert_eq!(adapted(&preset, false), (Background::White, Some(0.001)));
+        let unbounded = preset.clone().with_scene_type(SceneType::Unbounded);
+        assert_eq!(adapted(&unbounded, true), (Background::Expected, Some(0.001)));
+        let black = Config { background: Background::Black, ..preset };
+        assert_eq!([true, false].map(|is_transparent| adapted(&black, is_transparent).0), [Background::Black; 2]);
+        assert_eq!(adapted(&Config::preset(Preset::Classic), true), (Background::White, None));
     }
 
     #[test]
@@ -530,7 +568,6 @@ mod tests {
             [&preset, &unbounded].map(|config| config.sampler.get::<MarchingConfig>().unwrap().clone());
         assert_eq!((after.occupancy.cascades, after.occupancy.resolution, after.samples), (6, 32, 4 * before.samples));
         assert_eq!((after.step, after.last_step, after.cone, after.view_step), (0.01, None, 1.0 / 64.0, 1.0 / 150.0));
-        assert_eq!((before.early_stop_eps, after.early_stop_eps), (0.01, 0.001));
         let [coarse, fine] =
             [&preset, &unbounded].map(|config| config.field.get::<InstantConfig>().unwrap().grid.finest);
         assert_eq!(fine, 2 * coarse);

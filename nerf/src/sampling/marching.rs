@@ -27,9 +27,6 @@ const CASCADE_RESOLUTION: usize = 32;
 /// Step lengths in an unbounded scene, in training and in renders, as shares of the box's side.
 const CASCADE_STEP: f64 = 1.0 / 100.0;
 const CASCADE_VIEW_STEP: f64 = 1.0 / 150.0;
-/// Early termination in an unbounded scene. What a longer ray would train there is fog: with 1e-2 some runs keep it, and
-/// lose 1 dB or more.
-const CASCADE_EARLY_STOP: f64 = 1e-3;
 /// Growth of the steps per unit of distance.
 const CASCADE_CONE: f64 = 1.0 / 64.0;
 /// The same values of a long training, whose steps shorten to the last one.
@@ -77,7 +74,7 @@ impl Default for MarchingConfig {
             view_step: 1.0 / 600.0,
             cone: 0.0,
             samples: 24576,
-            early_stop_eps: 1e-2,
+            early_stop_eps: 1e-3,
             quadrature: Quadrature::Midpoint,
         }
     }
@@ -89,7 +86,6 @@ impl MarchingConfig {
     pub fn cascaded(mut self) -> Self {
         (self.occupancy.cascades, self.occupancy.resolution) = (CASCADES, CASCADE_RESOLUTION);
         self.step = CASCADE_STEP;
-        self.early_stop_eps = CASCADE_EARLY_STOP;
         (self.last_step, self.cone, self.view_step) = match self.last_step {
             Some(_) => (Some(LONG_LAST_STEP), LONG_CONE, LONG_VIEW_STEP),
             None => (None, CASCADE_CONE, CASCADE_VIEW_STEP),

@@ -95,8 +95,8 @@ pub(crate) fn rays_loss<'t>(
     };
     let fine = photometric(&rendered, &color);
     let error = match model.config.loss {
-        Loss::Mse if !is_expected => fine.item(),
-        // PSNR needs squared errors of colours, for any loss.
+        Loss::Mse => fine.item(),
+        // PSNR needs squared errors, for any loss.
         _ => tape.no_grad(|| Loss::Mse.sum(&color, &target).item()),
     };
     let coarse = coarse.iter().map(|seen| photometric(seen, &shown(seen)));

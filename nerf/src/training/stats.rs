@@ -85,7 +85,7 @@ pub struct StepStats {
     /// Mean loss over rays and channels; for a hierarchical model, coarse plus fine.
     #[serde(deserialize_with = "number_or_nan")]
     pub loss: f64,
-    /// PSNR on this step's rays, in dB.
+    /// PSNR on this step's rays, in dB, over the backgrounds of training.
     #[serde(deserialize_with = "number_or_nan")]
     pub psnr: f64,
     /// Mean opacity of this step's rays, 0 to 1.

@@ -58,8 +58,8 @@ impl HashGrid {
     /// Adds the gradient of one level's rows to `grad`, in the order of the samples.
     ///
     /// `positions` are `[samples, 3]`, `d_out` `[samples, width]` is the gradient of their encoding. Samples whose
-    /// gradients on this level are all at most `cut` in magnitude add nothing; with a `cut` of 0 these are the zeros. A
-    /// NaN coordinate gives NaN.
+    /// gradients on this level are all at most `cut` in magnitude add nothing; with a `cut` of 0 these are the zeros. For
+    /// the others, a NaN coordinate gives NaN.
     ///
     /// # Panics
     /// If `level` is out of range or a length does not fit.
@@ -157,14 +157,22 @@ impl HashEncoding {
         HashEncoding { grid, gradient_cut: 0.0 }
     }
 
-    /// The encoding whose table gets no gradient from samples where that of a level is small: at most `gradient_cut`
-    /// times its root mean square over all samples and features. So at most that share of the level's gradient is
-    /// dropped, in the Euclidean norm.
+    /// The encoding whose table gets no gradient from samples where that of a level's features is small: at most
+    /// `gradient_cut` times its root mean square, over the samples and features of a call of the operation.
     ///
-    /// It makes training faster, since an optimizer such as Adam moves every row by about the same length, however
-    /// small its gradient. Higher derivatives use the exact gradient.
+    /// The dropped gradient of the features is at most that share of the whole, in the Euclidean norm; a row loses at most
+    /// that root mean square times `gradient_cut` and its number of samples. Where many small gradients agree and large
+    /// ones cancel, a row may lose most of its sum.
+    ///
+    /// It makes training faster, since an optimizer such as Adam moves a row by about the same length however small its
+    /// gradient is. Gradients that can be differentiated again, and those of the positions, are exact.
+    ///
+    /// # Panics
+    /// If `gradient_cut` is not 0 to 1.
     #[must_use]
+    #[track_caller]
     pub fn with_gradient_cut(self, gradient_cut: f64) -> Self {
+        assert!((0.0..=1.0).contains(&gradient_cut), "a gradient cut of {gradient_cut}; use 0 to 1");
         HashEncoding { gradient_cut, ..self }
     }
 
