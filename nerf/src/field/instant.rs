@@ -34,10 +34,9 @@ pub struct InstantConfig {
     #[serde(default)]
     #[serde(alias = "codes")]
     pub appearance_embedding_dim: usize,
-    /// Gradient cut of the hash grid. Samples do not change a level of the table if the gradients of its features are at
-    /// most this share of their root mean square over a tile of a training step. Steps become faster, and slightly
-    /// biased: the dropped gradient of the features is at most this share, in the Euclidean norm. 0 drops nothing.
-    /// Range: 0 to 1.
+    /// Gradient cut of the hash grid. A sample does not change a level of the table if all gradients of its features are
+    /// small: at most this share of their root mean square over a tile. Steps become faster, and slightly biased. The
+    /// dropped gradient of the features is at most this share, in the Euclidean norm. 0 drops nothing. Range: 0 to 1.
     #[serde(default)]
     pub gradient_cut: f64,
 }
