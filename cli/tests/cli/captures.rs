@@ -1,6 +1,6 @@
 //! `raygrad train` and `eval` on captures with depth, inaccurate cameras and varying exposure.
 
-use super::{Place, SIZE, SMALL, png};
+use super::{PLAIN, Place, SIZE, SMALL, png};
 use raygrad::Real;
 use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::{Camera, Config, Image, Model, SceneBox};
@@ -111,7 +111,7 @@ fn eval_uses_the_models_cameras() {
     let place = Place::with_scene();
     // A large learning rate, so that the refinement is visible.
     let fast = r#"--set poses={"constant":{"rate":0.1}} --set camera_optimizer={"focal":{"constant":{"rate":0.02}}}"#;
-    place.succeeds(&format!("train scene --steps 40 --out run {SMALL} {fast}"));
+    place.succeeds(&format!("train scene --steps 40 --out run {SMALL} {PLAIN} {fast}"));
     let model = model(&place, "run");
     let view = |camera: &Camera| model.render(camera, [1.0; 3]).color;
     // Animations through images use them too.

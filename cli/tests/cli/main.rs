@@ -55,6 +55,11 @@ const SMALL: &str = "--set field.grid.levels=4 --set field.grid.log2_table=10 --
                      --set field.color_width=16 --set sampler.occupancy.resolution=16 --set sampler.samples=1024 \
                      --set sampler.step=0.02 --set sampler.view_step=0.02 --set sampler.cone=0.03";
 
+/// Settings besides [`SMALL`] with which few steps of training have a known course: exact gradients, all samples, a
+/// deeper colour network, and random backgrounds.
+const PLAIN: &str = "--set field.color_depth=2 --set field.gradient_cut=0 --set sampler.early_stop_eps=0.001 \
+                     --background random";
+
 /// The same for the preset small, which samples hierarchically.
 const CLASSIC: &str = "--preset small --set field.width=16 --set field.view_width=16 --set sampler.proposal.width=16 \
                        --set sampler.batch=64 --set sampler.coarse=16 --set sampler.fine=16";

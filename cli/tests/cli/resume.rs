@@ -1,6 +1,6 @@
 //! Interrupted runs, and resuming them.
 
-use super::{Place, SMALL};
+use super::{PLAIN, Place, SMALL};
 use serde_json::Value;
 use std::fs::File;
 use std::path::PathBuf;
@@ -300,7 +300,9 @@ fn diverged_run_returns_at_a_lower_lr() {
     let place = Place::empty();
     let (succeeds, said) = complaints(
         &place,
-        &format!("train --downscale 10 --steps 120 --out run --tensorboard {SMALL} --set schedule.linear.from=3e7"),
+        &format!(
+            "train --downscale 10 --steps 120 --out run --tensorboard {SMALL} {PLAIN} --set schedule.linear.from=3e7"
+        ),
     );
     assert!(succeeds && said.contains("recorded at nerf/src/field/instant.rs:"), "{said}");
     let retreats = said.matches("resuming from step 0 with 0.25 times the learning rate").count() as i32;
