@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::dataset::{Capture, Dataset, Frame, Split};
 use raygrad::nerf::imaging::lpips::{Backbone, Lpips};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
-use raygrad::nerf::{Background, Error, Image, Result, available_memory, fitted_cameras, rename_durable, write_atomic};
+use raygrad::nerf::{Error, Image, Result, available_memory, fitted_cameras, rename_durable, write_atomic};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
@@ -183,7 +183,7 @@ pub fn run(args: &Args) -> Work<()> {
         number.filter(|_| appearance == Appearance::Own).map(|number| number as u32)
     };
     let looks = data.frames.iter().map(own).collect();
-    let background = shown_background(model.config.background);
+    let background = model.config.background.in_output();
     let conditions = Conditions {
         raygrad: env!("CARGO_PKG_VERSION").to_owned(),
         scene: scene.absolute()?,
@@ -425,27 +425,12 @@ fn check_seen(backbone: Backbone, data: &Dataset, appearance: Appearance) -> Res
     Ok(())
 }
 
-/// The background of compared images. Random and expected backgrounds are for training only.
-fn shown_background(trained: Background) -> Background {
-    match trained {
-        Background::Random | Background::Expected => Background::White,
-        fixed => fixed,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use raygrad::nerf::dataset::Mask;
     use raygrad_scenes::embedded;
     use std::sync::Arc;
-
-    #[test]
-    fn views_are_compared_over_fixed_backgrounds() {
-        let shown = [Background::White, Background::Black, Background::Random, Background::Expected];
-        let expected = [Background::White, Background::Black, Background::White, Background::White];
-        assert_eq!(shown.map(shown_background), expected);
-    }
 
     #[test]
     fn check_seen_small_or_masked_images_fail() {

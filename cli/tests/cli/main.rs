@@ -55,8 +55,8 @@ const SMALL: &str = "--set field.grid.levels=4 --set field.grid.log2_table=10 --
                      --set field.color_width=16 --set sampler.occupancy.resolution=16 --set sampler.samples=1024 \
                      --set sampler.step=0.02 --set sampler.view_step=0.02 --set sampler.cone=0.03";
 
-/// Settings besides [`SMALL`] with which few steps of training have a known course: exact gradients, all samples, a
-/// deeper colour network, and random backgrounds.
+/// Settings besides [`SMALL`] for tests that need a run of few steps to diverge, or to learn its cameras: what makes
+/// training faster changes both.
 const PLAIN: &str = "--set field.color_depth=2 --set field.gradient_cut=0 --set sampler.early_stop_eps=0.001 \
                      --background random";
 

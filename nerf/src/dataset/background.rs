@@ -38,12 +38,18 @@ impl Background {
         }
     }
 
+    /// Returns the background of output and evaluation: white in place of those that only training has.
+    #[must_use]
+    pub fn in_output(self) -> Background {
+        match self {
+            Background::White | Background::Random | Background::Expected => Background::White,
+            Background::Black => Background::Black,
+        }
+    }
+
     /// Returns the colour behind images in output and evaluation.
     pub fn shown(self) -> [f32; 3] {
-        match self {
-            Background::White | Background::Random | Background::Expected => [1.0; 3],
-            Background::Black => [0.0; 3],
-        }
+        if self.in_output() == Background::Black { [0.0; 3] } else { [1.0; 3] }
     }
 }
 
@@ -130,8 +136,19 @@ mod tests {
         let colour = Background::Random.draw(&mut rng);
         assert_eq!(colour, untouched.random::<[f32; 3]>());
         assert_ne!(colour, Background::Random.draw(&mut rng));
-        assert_eq!(Background::Random.shown(), [1.0; 3]);
-        assert_eq!((Background::Expected.draw(&mut rng), Background::Expected.shown()), ([0.5; 3], [1.0; 3]));
+        assert_eq!(Background::Expected.draw(&mut rng), [0.5; 3]);
+    }
+
+    #[test]
+    fn output_has_fixed_backgrounds() {
+        for (background, output, color) in [
+            (Background::White, Background::White, 1.0),
+            (Background::Black, Background::Black, 0.0),
+            (Background::Random, Background::White, 1.0),
+            (Background::Expected, Background::White, 1.0),
+        ] {
+            assert_eq!((background.in_output(), background.shown()), (output, [color; 3]));
+        }
     }
 
     #[test]

@@ -176,6 +176,11 @@ impl HashEncoding {
         HashEncoding { gradient_cut, ..self }
     }
 
+    /// The grid.
+    pub fn grid(&self) -> &HashGrid {
+        &self.grid
+    }
+
     /// The largest gradient of each level that is dropped.
     pub(super) fn cuts<T: Scalar>(&self, d_out: &[T]) -> Vec<T> {
         let (width, features) = (self.grid.width(), self.grid.features());
