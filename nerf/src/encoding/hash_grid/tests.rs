@@ -261,6 +261,17 @@ fn gradient_cut_drops_small_gradients_of_each_level() {
 }
 
 #[test]
+fn gradient_cut_drops_small_gradients_of_any_number_of_features() {
+    for features in [1, 2, 4, 8] {
+        let grid = grid(2, features, 7, 4, 16);
+        let (positions, width) = (units(30, 1), grid.width());
+        let d_out: Vec<f32> = (0..10 * width).map(|i| if i / width < 5 { 1.0 } else { 1e-3 }).collect();
+        let large: Vec<f32> = d_out.iter().map(|x| if *x < 1.0 { 0.0 } else { *x }).collect();
+        assert_eq!(table_gradient(&grid, &positions, &d_out, 0.1), table_gradient(&grid, &positions, &large, 0.0));
+    }
+}
+
+#[test]
 fn gradient_cut_is_relative_to_the_root_mean_square() {
     let (grid, samples) = (grid(2, 4, 7, 4, 16), 500);
     let width = grid.width();
