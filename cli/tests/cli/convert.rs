@@ -410,3 +410,35 @@ fn control_characters_of_names_do_not_reach_the_terminal() {
         assert!(said.contains("\\u{1b}[2J\\u{7}<!--<script>.png"), "{arguments}: {said}");
     }
 }
+
+#[test]
+fn captures_are_found_from_within_their_folders() {
+    let place = Place::empty();
+    with_lens(&place);
+    place.succeeds("prepare scene --to colmap --out model");
+    std::fs::create_dir_all(place.path("other/colmap")).unwrap();
+    std::fs::rename(place.path("model/sparse"), place.path("other/colmap/sparse")).unwrap();
+    std::fs::rename(place.path("model/images"), place.path("other/images")).unwrap();
+    for (number, (folder, name)) in [
+        ("scene", "transforms.json"),
+        ("scene", "."),
+        ("scene/images", "../transforms.json"),
+        (".", "other"),
+        ("other", "colmap/sparse/0"),
+        ("other/colmap", "sparse/0"),
+        ("other/colmap/sparse", "0"),
+        ("other/colmap/sparse/0", "."),
+        ("other/colmap/sparse/0", "images.bin"),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let to = place.path(&format!("made{number}"));
+        let mut command = place.command(&format!("prepare {name} --to nerfstudio --out"));
+        let output = command.arg(&to).current_dir(place.path(folder)).output().unwrap();
+        assert!(output.status.success(), "{folder}, {name}: {}", String::from_utf8_lossy(&output.stderr));
+        let made = Capture::read(&to).unwrap();
+        assert_eq!(made.present().count(), 9, "{folder}, {name}");
+        assert!(to.join("images/more/8.png").is_file(), "{folder}, {name}: folders tell images apart");
+    }
+}

@@ -31,15 +31,23 @@ impl Description {
         Description { format, folder: folder.to_owned(), file }
     }
 
+    /// The COLMAP model with this file of images. Where `folder` is the model's or its `sparse`, the capture is around it.
+    fn of_model(folder: &Path, file: PathBuf) -> Self {
+        let root = colmap::root(folder);
+        let is_inside = file.parent().is_some_and(|model| colmap::root(model) == root);
+        Description::new(Format::Colmap, if is_inside { &root } else { folder }, file)
+    }
+
     /// The description that a file is part of.
     fn of_file(file: &Path) -> Option<Self> {
-        let folder = file.parent()?;
+        // The parent of a bare name is empty.
+        let folder = file.parent().map(|folder| if folder.as_os_str().is_empty() { Path::new(".") } else { folder })?;
         let (name, ending) = (file.file_name()?.to_str()?, file.extension()?.to_str()?);
         let format = match (name, ending) {
             _ if Split::ALL.iter().any(|split| name == blender::name_of(*split)) => Format::Blender,
             (_, "json") => Format::Transforms,
             ("poses_bounds.npy", _) => Format::Llff,
-            _ => return Some(Description::new(Format::Colmap, &colmap::root(folder), colmap::images_beside(file)?)),
+            _ => return Some(Description::of_model(folder, colmap::images_beside(&folder.join(name))?)),
         };
         Some(Description::new(format, folder, file.to_owned()))
     }
@@ -84,7 +92,7 @@ fn descriptions(folder: &Path) -> Vec<Description> {
     if let Some(file) = blender::file(folder) {
         out.push(Description::new(Format::Blender, folder, file));
     }
-    out.extend(colmap::models(folder).into_iter().map(|file| Description::new(Format::Colmap, folder, file)));
+    out.extend(colmap::models(folder).into_iter().map(|file| Description::of_model(folder, file)));
     let file = llff::file(folder);
     if file.is_file() {
         out.push(Description::new(Format::Llff, folder, file));

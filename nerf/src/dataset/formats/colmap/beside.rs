@@ -40,10 +40,14 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The folder of the capture of a model: that of `sparse` for the model `sparse/0`, also in `colmap` or `distorted`.
+/// The folder of the capture of a model: that of `sparse` for the model `sparse/0`, or the one around it if that is
+/// `colmap` or `distorted` and has no images.
 pub(crate) fn root(model: &Path) -> PathBuf {
-    let sparse = model.ancestors().take(2).find(|folder| folder.ends_with("sparse"));
+    // Paths such as `.` and `sparse/0` have a parent only in their absolute form.
+    let whole = std::path::absolute(model).unwrap_or_else(|_| model.to_owned());
+    let sparse = whole.ancestors().take(2).find(|folder| folder.ends_with("sparse"));
     let Some(parent) = sparse.and_then(Path::parent) else { return model.to_owned() };
-    let is_inner = ["colmap", "distorted"].iter().any(|name| parent.ends_with(name));
+    let has_images = IMAGES.iter().any(|name| parent.join(name).is_dir());
+    let is_inner = ["colmap", "distorted"].iter().any(|name| parent.ends_with(name)) && !has_images;
     parent.parent().filter(|_| is_inner).unwrap_or(parent).to_owned()
 }

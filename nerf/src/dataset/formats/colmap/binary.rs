@@ -15,7 +15,7 @@ const OBSERVATION: usize = 8 + 8 + 8;
 /// The bytes of a track element: an image and the index of its observation.
 const TRACK_ELEMENT: usize = 4 + 4;
 /// The bytes of a camera with the fewest parameters.
-const LEAST_CAMERA: usize = 4 + 4 + 8 + 8 + 3 * 8;
+const LEAST_CAMERA: usize = 4 + 4 + 8 + 8 + 2 * 8;
 /// The bytes of an image with an empty name and no observation.
 const LEAST_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
 

@@ -406,6 +406,15 @@ fn spherical_and_plain_fisheye_models_are_read() {
         read(folder(Encoding::Text, "sparse/0", &files).path()).unwrap().views[0].camera.clone()
     };
     let panorama = with("0 EQUIRECTANGULAR 80 40 80 40");
+    // Alone, it is the smallest camera of a binary file.
+    let views = vec![View::new("0.png", "images[0]", panorama.clone())];
+    let place = tempfile::tempdir().unwrap();
+    let alone = Capture::new(place.path(), "transforms.json".into(), Format::Transforms, views);
+    for encoding in Encoding::ALL {
+        let folder = tempfile::tempdir().unwrap();
+        write(&alone, folder.path(), encoding).unwrap();
+        assert_eq!(read(folder.path()).unwrap().views[0].camera, panorama, "{encoding:?}");
+    }
     assert_eq!(panorama.lens, Lens::Equirectangular);
     // COLMAP's formula: longitude 2 pi (x / w - 1/2), latitude pi (1/2 - y / h), in its axes.
     let (theta, phi) = (2.0 * std::f64::consts::PI * (0.7 - 0.5), std::f64::consts::PI * (0.5 - 0.4));

@@ -104,7 +104,18 @@ fn files_name_their_description() {
     ] {
         assert_eq!(count(file), expected, "{file}");
     }
-    assert_eq!(read(&path.join("sparse/3"), None).unwrap().present().count(), 2, "a model's folder");
+    assert_eq!(count("sparse/3"), 2, "a model's folder");
+    for (inside, root) in
+        [("colmap/sparse/0", ""), ("distorted/sparse/0", ""), ("sparse", ""), ("sparse/a", "sparse/a")]
+    {
+        let other = path.join("other").join(inside);
+        std::fs::create_dir_all(&other).unwrap();
+        for name in ["cameras.bin", "images.bin"] {
+            std::fs::copy(path.join("sparse/3").join(name), other.join(name)).unwrap();
+        }
+        let expected = if inside == "sparse/a" { path.join("other") } else { path.join("other").join(root) };
+        assert_eq!(read(&other, None).unwrap().folder, expected, "{inside}");
+    }
     let message = read(&path.join("some.json"), Some(Format::Llff)).unwrap_err().to_string();
     assert!(message.ends_with("some.json: describes a capture in the format transforms.json, not LLFF"), "{message}");
     assert!(read(&path.join("sparse/3/images.bin"), Some(Format::Colmap)).is_ok());
