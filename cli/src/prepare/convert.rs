@@ -397,10 +397,12 @@ pub fn relative(folder: &Path, view: &View) -> Result<String> {
     }
 }
 
-/// The path within an image folder: `0.jpg` for `images/0.jpg` and `images_4/0.jpg`.
+/// The path within an image folder: `0.jpg` for `images/0.jpg` and `images_4/0.jpg`. Other names, such as
+/// `images_train`, tell images apart.
 fn inner(path: &str) -> &str {
+    let is_factor = |name: &str| name.strip_prefix("images_").is_some_and(|factor| factor.parse::<u32>().is_ok());
     match path.split_once('/') {
-        Some((first, rest)) if first == "images" || first.starts_with("images_") => rest,
+        Some((first, rest)) if first == "images" || is_factor(first) => rest,
         _ => path,
     }
 }
@@ -476,6 +478,7 @@ mod tests {
         for (rest, target, image, name) in [
             ("images/a/0.jpg", Target::Nerfstudio, "images/a/0.jpg", "images/a/0.jpg"),
             ("images_4/0.png", Target::Nerfstudio, "images/0.png", "images/0.png"),
+            ("images_train/0.png", Target::Nerfstudio, "images_train/0.png", "images_train/0.png"),
             ("test/r_0.png", Target::Nerfstudio, "test/r_0.png", "test/r_0.png"),
             ("0.jpg", Target::Nerfstudio, "images/0.jpg", "images/0.jpg"),
             ("images/a/0.jpg", Target::Colmap, "images/a/0.jpg", "a/0.jpg"),

@@ -75,13 +75,14 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
 }
 
 impl Layers<'_, '_> {
-    /// Reads a side of the image, in pixels.
+    /// Reads a side of the image, in pixels. BlenderNeRF writes fractions, which Blender and nerfstudio drop.
     fn side(&self, name: &str) -> Result<Option<usize>> {
         match self.number(name)? {
-            Some(x) if !((1.0..=SIDE).contains(&x) && x.fract() == 0.0) => {
-                Err(self.error(name, format!("must be an integer number of pixels, 1 to {SIDE}, is {x}")))
+            Some(x) if !(1.0..=SIDE).contains(&x) => {
+                Err(self.error(name, format!("must be a number of pixels, 1 to {SIDE}, is {x}")))
             }
-            other => Ok(other.map(|x| x as usize)),
+            // A product such as 1000 * 0.7 may lie just below an integer.
+            other => Ok(other.map(|x| (x + 1e-6).floor() as usize)),
         }
     }
 

@@ -279,9 +279,13 @@ fn invalid_camera_numbers_are_named() {
             assert!(message.contains(&expected) || value == "1e999", "{message}");
         }
     }
-    for value in [json!(0), json!(-64), json!(64.5), json!(1e9)] {
-        fails(|d| d["w"] = value.clone(), &["`w`: must be an integer number of pixels, 1 to 1048576"]);
-        fails(|d| d["frames"][0]["h"] = value, &["`frames[0].h`: must be an integer number of pixels"]);
+    for value in [json!(0), json!(-64), json!(0.5), json!(1e9)] {
+        fails(|d| d["w"] = value.clone(), &["`w`: must be a number of pixels, 1 to 1048576"]);
+        fails(|d| d["frames"][0]["h"] = value, &["`frames[0].h`: must be a number of pixels"]);
+    }
+    for (value, side) in [(json!(633.6), 633), (json!(64.5), 64), (json!(1000.0 * 0.7 - 1e-10), 700)] {
+        let camera = &cameras(|d| (d["w"], d["h"]) = (value, json!(200.25)))[0];
+        assert_eq!([camera.width, camera.height], [side, 200], "a fraction is dropped");
     }
     for value in [json!(0), json!(-100), json!(1e-9), json!(1e300)] {
         fails(|d| d["fl_x"] = value.clone(), &["`fl_x`: must be a focal length"]);
