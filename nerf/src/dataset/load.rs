@@ -33,6 +33,8 @@ const WHITE_BORDER: f64 = 0.98;
 const MOST_DOWNSCALE: u64 = 1 << 14;
 /// The least mask value of a used pixel.
 pub(super) const WHITE: f32 = 0.99;
+/// The least value of the brightest pixel of a mask. Programs that number objects write 1, 2, 3.
+const LEAST_WHITE: f32 = 0.1;
 
 /// Options of [`Capture::load`].
 #[derive(Clone, Copy)]
@@ -201,11 +203,11 @@ impl Capture {
             let Some(path) = &view.image else { continue };
             let name = |error| Error::field(&self.file, &view.field, error);
             let has_alpha = Photo::file_has_alpha(path).map_err(name)?;
-            alpha += usize::from(has_alpha);
             match Photo::open(path, None) {
                 Ok(photo) => {
                     // A transparent border may be left by undistortion, so it is no sign of an empty background.
                     clear += usize::from(photo.transparent_share() > CLEAR);
+                    alpha += usize::from(photo.transparent_share() > 0.0);
                     white += usize::from(!has_alpha && photo.white_border() > WHITE_BORDER);
                 }
                 Err(error) if has_alpha => return Err(name(error)),
@@ -216,8 +218,8 @@ impl Capture {
         let empty = match (2 * clear > total, white == total) {
             (true, _) => Some("images have a transparent background"),
             (_, true) => Some("images show an object before white"),
-            // The Blender format stores objects with an alpha channel.
-            _ if 2 * alpha > total && self.format == Format::Blender => Some("images have alpha"),
+            // An object may fill most of the image. Blender writes an alpha channel without one, too.
+            _ if 2 * alpha > total && self.format == Format::Blender => Some("images have transparent pixels"),
             _ => None,
         };
         SceneAnalysis::new(self, empty, asked)
@@ -461,9 +463,11 @@ fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize
     found.map_or_else(|| (path.to_owned(), downscale), |path| (path, 1))
 }
 
-/// Returns true if the aspect ratios of an image and a camera agree, up to the rounding of a side.
+/// Returns true if the aspect ratios of an image and a camera agree, up to the rounding of a side. ffmpeg, and so
+/// nerfstudio, drops the fractions of both sides.
 pub(crate) fn same_shape([width, height]: [usize; 2], camera: &Camera) -> bool {
-    if [width, height] == [camera.width, camera.height] {
+    let factor = camera.width / width.max(1);
+    if [width, height] == [camera.width, camera.height].map(|side| side / factor.max(1)) {
         return true;
     }
     let [w, h] = [width as f64, height as f64];
@@ -491,11 +495,25 @@ pub(crate) fn mask_fits(mask: [usize; 2], image: [usize; 2]) -> bool {
     (mask[0] * image[1]).abs_diff(mask[1] * image[0]) <= longest
 }
 
-/// Reads a mask (white for used pixels) of an image of the size `of`, resampled to the size `to`.
-fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Photo> {
+/// Opens a mask, white for used pixels, in the orientation of the size `of`.
+pub(super) fn open_mask(path: &Path, of: [usize; 2]) -> Result<Photo> {
     let mask = Photo::open(path, Some(of))?;
     // Transparent pixels are black, whatever their colour.
     let mask = if mask.has_alpha() { mask.to_image().over([0.0; 3]).into() } else { mask };
+    let most = mask.pixels().map(|pixel| pixel[0]).fold(0.0, f32::max);
+    if most > 0.0 && most < LEAST_WHITE {
+        let what = format!(
+            "has values up to {:.0} of 255, so it uses no pixel: write 255 (white) for pixels to use",
+            (255.0 * most).max(1.0)
+        );
+        return Err(Error::file(path, what));
+    }
+    Ok(mask)
+}
+
+/// Reads a mask of an image of the size `of`, resampled to the size `to`.
+fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Photo> {
+    let mask = open_mask(path, of)?;
     let from = [mask.width, mask.height];
     if !mask_fits(from, of) {
         let what =

@@ -2,7 +2,7 @@
 
 use super::capture::View;
 use super::image::Image;
-use super::load::{WHITE, open, size_for};
+use super::load::{WHITE, open, open_mask, size_for};
 use super::photo::Photo;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -119,7 +119,7 @@ impl View {
         };
         let photo = moved(&open(image, &self.camera)?);
         let Some(mask) = &self.mask else { return Ok((photo, None)) };
-        let mask = moved(&open(mask, &self.camera)?);
+        let mask = moved(&open_mask(mask, size_for(mask, &self.camera)?)?);
         let data = mask.pixels().map(|pixel| f32::from(u8::from(pixel[0] >= WHITE))).collect();
         Ok((photo, Some(Image { width: size[0], height: size[1], channels: 1, data })))
     }

@@ -137,6 +137,10 @@ fn image_of_other_shape_than_camera_is_an_error() {
         ([333, 250], [4000, 3000], true),
         ([750, 1000], [4000, 3000], false),
         ([270, 480], [1080, 1920], true),
+        ([360, 270], [1440, 1083], true),
+        ([361, 270], [1440, 1083], false),
+        ([120, 67], [1440, 815], true),
+        ([120, 66], [1440, 815], false),
     ] {
         assert_eq!(same_shape(size, &camera(of[0], of[1])), fits, "{size:?} for {of:?}");
     }
@@ -452,5 +456,47 @@ fn transparent_pixels_of_a_mask_are_black_at_each_size() {
     for side in [8, 4, 16] {
         let mask = used_pixels(&path, [16, 16], [side; 2]).unwrap();
         assert!(!mask.uses(side / 2, 0) && mask.uses(side / 2, side - 1), "{side}");
+    }
+}
+
+#[test]
+fn faint_masks_are_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 4);
+    capture.split_by_default();
+    let path = folder.path().join("mask.png");
+    let analysis = capture.analyze_scene(None).unwrap();
+    capture.views.iter_mut().for_each(|view| view.mask = Some(path.clone()));
+    let view = capture.views.iter().find(|view| view.image.is_some()).unwrap();
+    for (value, is_faint) in [(1, true), (3, true), (25, true), (26, false), (255, false)] {
+        let data = (0..96).map(|i| if i < 40 { f32::from(value as u8) / 255.0 } else { 0.0 }).collect();
+        Image { width: 12, height: 8, channels: 1, data }.save_png(&path).unwrap();
+        let expected = format!("mask.png: has values up to {value} of 255, so it uses no pixel: write 255");
+        let load = |mask_as_alpha| {
+            capture.load(Split::Train, &analysis, &LoadOptions { mask_as_alpha, ..LoadOptions::default() }).map(drop)
+        };
+        for read in [load(false), load(true), view.seen_by(&view.camera.resized(12, 8)).map(drop)] {
+            assert!(!is_faint || read.unwrap_err().to_string().contains(&expected), "{value}");
+        }
+        assert!(is_faint || load(true).is_ok(), "{value}");
+    }
+}
+
+#[test]
+fn opaque_alpha_is_no_empty_background() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 4);
+    capture.format = Format::Blender;
+    // One transparent pixel is less than 5 %.
+    for (alpha, expected) in [(1.0, false), (0.5, false), (0.0, true)] {
+        for view in &capture.views {
+            let Some(path) = &view.image else { continue };
+            let mut image = Image { width: 12, height: 8, channels: 4, data: vec![0.3; 12 * 8 * 4] };
+            (0..96).for_each(|i| image.data[4 * i + 3] = 1.0);
+            image.data[4 * 17 + 3] = alpha;
+            image.save_png(path).unwrap();
+        }
+        let analysis = capture.analyze_scene(None).unwrap();
+        assert_eq!(analysis.scene_type == SceneType::Bounded, expected, "{}", analysis.reason);
     }
 }
