@@ -203,6 +203,51 @@ mod tests {
         text.split(';').map(tensor).collect()
     }
 
+    /// The gradient of the sum of the first input's gradient and twice the second's: of differences, the sum would be 0.
+    fn second<T: Scalar>(operation: &str, x: &[Tensor<T>]) -> Vec<Tensor<T>> {
+        let tape = Tape::<T>::new();
+        let vars: Vec<Var<'_, T>> = x.iter().map(|x| tape.leaf(x.clone())).collect();
+        let x: Vec<&Var<'_, T>> = vars.iter().collect();
+        let first = apply(operation, &vars).unwrap().sum().grad_graph(&x);
+        let total = first.iter().zip(1..).map(|(x, k)| x.sum() * f64::from(k)).reduce(|a, b| a + b).unwrap();
+        total.tracked().grad(&x)
+    }
+
+    #[test]
+    fn second_derivatives_are_limits_where_there_are_some() {
+        for (operation, at, expected) in [
+            ("pow(a, b)", "[0, 0, 0]; [2, 3, 4]", "[2, 0, 0]; [0, 0, 0]"),
+            ("pow(a, b)", "0; 0", "0; 0"),
+            ("pow(a, b)", "3; 0", "0.6666666666666666; 2.7472312549584976"),
+            ("logsumexp(x)", "[-inf, -inf]", "[0, 0]"),
+            ("logsumexp(x)", "[0, -inf]", "[0, 0]"),
+            ("smooth_l1(a, b, 0)", "1; 1", "0; 0"),
+            ("smooth_l1(a, b, 0)", "2; 1", "0; 0"),
+            ("absolute_error(a, b)", "1; 1", "0; 0"),
+            ("powi(x, 0)", "0", "0"),
+            ("xlogy(a, b)", "0; 2", "1; 0.5"),
+            ("norm_l1(x)", "[0, -2]", "[0, 0]"),
+            ("prod(x)", "[0, 3]", "[1, 1]"),
+            ("softmax(x)", "[-inf, 0]", "[0, 0]"),
+            ("sigmoid(x)", "-inf", "0"),
+            ("softplus(x)", "inf", "0"),
+            ("log_sigmoid(x)", "-inf", "0"),
+            ("gelu(x)", "-inf", "0"),
+            ("silu(x)", "-inf", "0"),
+            ("tanh(x)", "inf", "0"),
+        ] {
+            let got = second::<f64>(operation, &tensors(at));
+            assert!(same(&got, &tensors(expected)), "{operation} at {at}: {got:?}");
+            let got = second::<f32>(operation, &tensors(at));
+            assert!(same(&got, &tensors(expected)), "{operation} at {at} in f32: {got:?}");
+        }
+        // A constant exponent.
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::from([0.0; 4]));
+        let first = x.pow(Tensor::from([0.0, 1.0, 2.0, 3.0])).sum().grad_graph(&[&x]).remove(0);
+        assert_eq!(first.sum().grad(&[&x])[0], [0.0, 0.0, 2.0, 0.0]);
+    }
+
     fn same<T: Scalar>(got: &[Tensor<T>], expected: &[Tensor<T>]) -> bool {
         let equal = |(a, b): (&T, &T)| {
             let (a, b) = (a.to_f64(), b.to_f64());

@@ -87,8 +87,11 @@ impl<T: Scalar> Tape<T> {
     /// assert_eq!(again.sum().grad(&[&x])[0], [0.0, 4.0, 6.0]);
     /// ```
     ///
+    /// An empty memo is ignored: all outputs are computed.
+    ///
+    /// # Panics
     /// If `f` runs fewer or other cacheable operations than those of the memo; other operations are found by their
-    /// shapes. An empty memo is ignored: all outputs are computed.
+    /// shapes.
     #[track_caller]
     pub fn reuse_outputs<R>(&self, memo: CachedOutputs<T>, f: impl FnOnce() -> R) -> R {
         if memo.values.is_empty() {

@@ -105,7 +105,7 @@ impl<'t, T: Scalar> Sheet<'t, T> {
 /// ```
 ///
 /// # Panics
-/// If shapes that meet in an operation do not broadcast, or `N` or `M` is 0.
+/// If shapes that meet in an operation do not broadcast, or `N` is 0 and `M` is not.
 #[track_caller]
 pub fn record<'t, T: Scalar, const N: usize, const M: usize>(
     x: [&Var<'t, T>; N],

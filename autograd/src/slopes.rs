@@ -316,7 +316,8 @@ pub(crate) fn base_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let is_ordinary = a.abs() * (one / a.abs());
     let base = is_ordinary.if_positive(a, one);
     // Where b - 1 is exact, its power; elsewhere its rounding error would count as many times as the logarithm is large.
-    let less = a.pow(b - one);
+    // Of two zeros it is infinite and not chosen; the next derivative would be NaN.
+    let less = (a.abs() + b.abs()).if_positive(a, one).pow(b - one);
     let is_exact = (b - one) * (b.like(1e6) - b);
     let power = is_exact.if_positive(less, y / base);
     // A zero base has its limit, and a subnormal y has lost digits.
@@ -336,10 +337,11 @@ pub(crate) fn base_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
 #[inline(always)]
 pub(crate) fn exponent_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let (zero, one, size) = (a.like(0.0), a.like(1.0), a.abs());
-    // A logarithm that is finite where it is not chosen, or the next derivative would be NaN.
+    // Logarithms that are finite where they are not chosen, or the next derivative would be NaN.
     let ln = size.if_positive(a, one).ln();
     let factors = [size.if_positive(y, one), size.if_positive(y * ln, one)];
     let full = checked!(s * (y * ln), one + one, [], factors, (s.wide() * E::Wide::pow(a, b, y) * ln.wide()).narrow());
-    let at_zero = s * (-b).if_positive(y * size.ln(), y * zero + a * zero);
+    let ln_of_size = (-b).if_positive(size, one).ln();
+    let at_zero = s * (-b).if_positive(y * ln_of_size, y * zero + a * zero);
     size.if_positive(full, at_zero)
 }

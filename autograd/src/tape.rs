@@ -197,6 +197,7 @@ impl<T: Scalar> Tape<T> {
     /// assert_eq!(tape.try_run(|| x.sum().item()).unwrap(), 12.0);
     /// ```
     ///
+    /// # Errors
     /// If shapes do not fit, [`check_finite`](Self::check_finite) finds a value that is not finite, or a gradient does
     /// not exist. The error has the text of the panic.
     pub fn try_run<R>(&self, f: impl FnOnce() -> R) -> Result<R, Error> {

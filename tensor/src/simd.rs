@@ -1,8 +1,8 @@
 //! Selects the instruction set at run time, so that one binary uses each machine's best.
 //!
 //! [`dispatch`] calls a closure inside a function that is compiled for AVX-512, for AVX2 + FMA, or for the target's
-//! baseline. LLVM vectorises the plain loops inside. The one other place that names instructions is the streaming
-//! store of large transposes.
+//! baseline. LLVM vectorises the plain loops inside. Other places that name instructions are the streaming
+//! store of large transposes and the walk over their tiles.
 //!
 //! `RAYGRAD_SIMD` caps the choice, for tests and measurements. `scalar` selects the plain fallback, `v3` at most AVX2 +
 //! FMA, and `v4` (the default) the best available. It is read once, at the first call.

@@ -99,7 +99,8 @@ impl Formula<2> for SmoothL1 {
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
         let (r, beta) = (a - b, a.like(self.beta));
         let near = product_over(g, r, SmoothL1::width(beta));
-        let far = r.if_positive(g, (-r).if_positive(-g, g * r));
+        // Constant also at 0, which is far if beta is 0; NaN stays.
+        let far = r.if_positive(g, (-r).if_positive(-g, g * r * a.like(0.0)));
         let da = (beta - r.abs()).if_positive(near, far);
         [da, -da]
     }

@@ -141,9 +141,9 @@ impl Formula<2> for Xlogy {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
-        // Where a is 0, the logarithm of 1 if b has none, and a division by 1: the next derivative is not NaN there.
-        let divisor = a.abs().if_positive(b, b.like(1.0));
-        [g * b.if_positive(b, divisor).ln(), product_over(g, a, divisor)]
+        // Where a is 0 and b has no logarithm, that of 1, and a division by 1: the next derivative is not NaN there.
+        let divisor = b.if_positive(b, a.abs().if_positive(b, b.like(1.0)));
+        [g * divisor.ln(), product_over(g, a, divisor)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.5..3.0);

@@ -135,8 +135,9 @@ impl<T: Scalar> Op<T> for LogSumExp {
             column.push(1);
             let is_lost = cx.output().map(|y| if y == T::from_f64(f64::NEG_INFINITY) { T::ONE } else { T::ZERO });
             let is_lost = is_lost.reshape(&column).broadcast_to(x.shape()).gt(T::ZERO);
-            // The logarithms of a row of -inf are NaN.
-            let logarithms = x.constant(f64::NEG_INFINITY).where_(&is_lost, x.log_softmax(-1));
+            // The logarithms of a row of -inf are NaN, and so would their gradients be that are not chosen.
+            let kept = x.constant(0.0).where_(&is_lost, &x);
+            let logarithms = x.constant(f64::NEG_INFINITY).where_(&is_lost, kept.log_softmax(-1));
             return Grads::one(power_times(&logarithms, &g.reshape(&column)));
         }
         let kernel = |x: &[T], n, out: &mut [T]| rows::logsumexp_rows_grad(x, n, g.value().as_slice(), out, cx.pool());

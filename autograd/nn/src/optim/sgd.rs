@@ -43,7 +43,7 @@ impl SgdConfig {
     pub fn check<T: Scalar>(&self) -> Result<(), SettingError> {
         check_decay::<T>("momentum", self.momentum)?;
         check("momentum", self.momentum, !self.nesterov || self.momentum > 0.0, "more than 0 to look ahead")?;
-        check_rate("decay", self.weight_decay)
+        check_rate("weight_decay", self.weight_decay)
     }
 }
 

@@ -314,7 +314,7 @@ fn settings_out_of_their_range_are_refused_by_name() {
     for (config, expected) in [
         (SgdConfig { momentum: 1.0, ..sgd }, "`momentum` is 1.0; use 0 to 1 - 2^-"),
         (SgdConfig { nesterov: true, ..sgd }, "`momentum` is 0.0; use more than 0 to look ahead"),
-        (SgdConfig { weight_decay: f64::INFINITY, ..sgd }, "`decay` is inf;"),
+        (SgdConfig { weight_decay: f64::INFINITY, ..sgd }, "`weight_decay` is inf;"),
     ] {
         assert!(message(|| drop(Sgd::<f32>::new(config))).contains(expected), "{config:?}");
     }
