@@ -94,8 +94,21 @@ impl<T: Scalar> RowShare<T> for RowGrad<T> {
     fn scatter(&self, sums: &mut RowSums<T>) {
         let width: usize = self.shape[1..].iter().product();
         assert_eq!([sums.table_rows(), sums.features()], [self.shape[0], width], "sums of the table's rows");
-        for (share, &row) in self.rows.as_slice().chunks_exact(width).zip(self.index.iter()) {
-            sums.add(row as usize, share);
+        // All rows of an index are summed in f64, which a long sum in f32 needs.
+        let row_of = |place: usize| self.index[place];
+        let mut order: Vec<usize> = (0..self.index.len()).collect();
+        order.sort_by_key(|&place| row_of(place));
+        let mut groups: Vec<&[usize]> = order.chunk_by(|&a, &b| row_of(a) == row_of(b)).collect();
+        groups.sort_unstable_by_key(|group| group[0]);
+        let share = |place: usize| &self.rows.as_slice()[place * width..][..width];
+        for group in groups {
+            let row = row_of(group[0]) as usize;
+            if let [place] = *group {
+                sums.add(row, share(place));
+                continue;
+            }
+            let sum = |i: usize| T::from_f64(group.iter().map(|&place| share(place)[i].to_f64()).sum());
+            sums.add(row, &(0..width).map(sum).collect::<Vec<T>>());
         }
     }
 }
@@ -124,10 +137,23 @@ mod tests {
             sums.add_to(&mut dense);
             dense
         };
-        // The sums of the sparse one are f32.
+        // Several gradients are added in f32.
         let close = |(a, b): (&f32, &f32)| (a - b).abs() <= 2e-7 * b.abs();
         assert!(run(true).iter().zip(&run(false)).all(close), "{:?} {:?}", run(true), run(false));
     }
+    #[test]
+    fn long_sums_of_a_row_keep_their_digits() {
+        let tape = Tape::<f32>::new();
+        let table = tape.leaf(Tensor::ones(&[3, 2]));
+        let index: Arc<[u32]> = (0..200_001).map(|i| if i == 77 { 2 } else { 1 }).collect();
+        let weights = tape.constant(Tensor::from([0.1, -0.3]));
+        let parts = (table.gather_rows(&index) * weights).sum().backward(&[&table]).remove(0).take::<RowGrad<f32>>();
+        let mut sums = RowSums::new(3, 2);
+        parts[0].scatter(&mut sums);
+        let exact = |x: f32| (200_000.0 * f64::from(x)) as f32;
+        assert_eq!((sums.rows(), sums.sums()), (&[1, 2][..], &[exact(0.1), exact(-0.3), 0.1, -0.3][..]));
+    }
+
     #[test]
     #[should_panic(expected = "index 1 is 4, but axis 0 has 4 entries")]
     fn a_row_gradient_beyond_its_table_is_refused() {
