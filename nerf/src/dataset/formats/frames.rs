@@ -8,6 +8,7 @@ use super::{matrix, paths};
 use crate::dataset::capture::View;
 use crate::dataset::photo::Photo;
 use crate::error::{Error, Result};
+use serde_json::Value;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
@@ -72,6 +73,8 @@ impl Frames {
             let (count, total) = (out.left_out.len(), all.len());
             out.assumptions.push(format!("left out {count} of {total} frames without a finite pose, such as `{name}`"));
         }
+        out.assumptions.extend(moving(&all));
+        out.assumptions.extend(unread_masks(out.views.iter().flatten()));
         Ok(out)
     }
 
@@ -120,6 +123,28 @@ impl Frames {
         }
         Ok(views)
     }
+}
+
+/// A note on the frames of a scene that moves, as those of D-NeRF.
+fn moving(frames: &[&Object<'_>]) -> Option<String> {
+    let mut times = frames.iter().map(|frame| frame.get("time").and_then(Value::as_f64));
+    let first = times.next()?;
+    let what = "frames have different times (`time`); all are trained as one still scene, so what moves is blurred";
+    times.any(|time| time != first).then(|| what.to_owned())
+}
+
+/// A note on instant-ngp's masks of what moves, which stand beside images.
+fn unread_masks<'a>(views: impl Iterator<Item = &'a View>) -> Option<String> {
+    let beside = |view: &View| {
+        let image = view.image.as_ref().filter(|_| view.mask.is_none())?;
+        let name = format!("dynamic_mask_{}.png", image.file_stem()?.to_str()?);
+        image.with_file_name(&name).is_file().then_some(name)
+    };
+    let names: Vec<String> = views.filter_map(beside).collect();
+    let (first, count) = (names.first()?, names.len());
+    Some(format!(
+        "masks such as `{first}` ({count}) are not read: invert them (white for pixels to use), named as `mask_path`"
+    ))
 }
 
 /// A listed path and its file, if it exists.

@@ -405,3 +405,25 @@ fn masks_take_no_place_of_images() {
     assert!(views.iter().all(|view| view.image.is_none()));
     assert_eq!(views[0].mask, Some(folder.path().join("images/0.png")));
 }
+
+#[test]
+fn moving_scenes_and_unread_masks_give_notes() {
+    let timed = |times: [f64; 3]| {
+        let set = |d: &mut Value| (0..3).for_each(|i| d["frames"][i]["time"] = json!(times[i]));
+        good(set).assumptions
+    };
+    assert_eq!(timed([0.5; 3]), [""; 0]);
+    assert!(matches!(&timed([0.0, 0.0, 1.0])[..], [note] if note.contains("`time`") && note.contains("still scene")));
+    let masked = |mask: bool| {
+        let folder = folder(|d| {
+            if mask {
+                d["frames"][1]["mask_path"] = json!("images/dynamic_mask_1.png");
+            }
+        });
+        picture(&folder.path().join("images/dynamic_mask_1.png"), 8, 6);
+        read(folder.path()).unwrap().assumptions
+    };
+    assert_eq!(masked(true), [""; 0]);
+    let expected = "masks such as `dynamic_mask_1.png` (1) are not read: invert them";
+    assert!(matches!(&masked(false)[..], [note] if note.starts_with(expected)));
+}
