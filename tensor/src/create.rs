@@ -116,6 +116,28 @@ impl<T: Scalar> From<Vec<T>> for Tensor<T> {
     }
 }
 
+impl<T: Scalar> From<&[T]> for Tensor<T> {
+    /// A vector of copies.
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// let rows = vec![1.0, 2.0, 3.0, 4.0];
+    /// assert_eq!(Tensor::from(&rows[1..3]), [2.0, 3.0]);
+    /// assert_eq!(Tensor::from(&rows).shape(), [4]);
+    /// assert_eq!(Tensor::from([[[1.0], [2.0]]]).shape(), [1, 2, 1]);
+    /// ```
+    fn from(values: &[T]) -> Self {
+        Tensor::from(values.to_vec())
+    }
+}
+
+impl<T: Scalar> From<&Vec<T>> for Tensor<T> {
+    /// A vector of copies.
+    fn from(values: &Vec<T>) -> Self {
+        Tensor::from(values.clone())
+    }
+}
+
 impl<T: Scalar, const N: usize> From<[T; N]> for Tensor<T> {
     /// A vector.
     fn from(values: [T; N]) -> Self {
@@ -127,6 +149,13 @@ impl<T: Scalar, const N: usize, const M: usize> From<[[T; M]; N]> for Tensor<T> 
     /// A matrix of these rows.
     fn from(rows: [[T; M]; N]) -> Self {
         Tensor::from_vec(&[N, M], rows.as_flattened().to_vec())
+    }
+}
+
+impl<T: Scalar, const N: usize, const M: usize, const K: usize> From<[[[T; K]; M]; N]> for Tensor<T> {
+    /// A tensor of three axes: matrices of rows.
+    fn from(matrices: [[[T; K]; M]; N]) -> Self {
+        Tensor::from_vec(&[N, M, K], matrices.as_flattened().as_flattened().to_vec())
     }
 }
 
