@@ -19,6 +19,7 @@
 //!
 //! Where an operation is not differentiable, the [conventions](crate::conventions) apply.
 
+use crate::error::ensure;
 use crate::{Tape, Var};
 use raygrad_tensor::{Scalar, Shape, Tensor};
 
@@ -170,7 +171,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         let slope = self.tape.enable_grad(|| {
             let seed = self.tape.leaf(self.tape.pool().full(self.shape(), T::ZERO));
             let grads = self.vjp(&seed, wrt);
-            inner(self.tape, &grads, tangents).tracked().grad_graph(&[&seed]).remove(0)
+            inner(self.tape, "jvp", &grads, tangents).tracked().grad_graph(&[&seed]).remove(0)
         });
         slope.recorded_or_constant()
     }
@@ -184,7 +185,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     pub fn hvp(&self, wrt: &[&Var<'t, T>], tangents: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
         let products = self.tape.enable_grad(|| {
             let grads = self.grad_graph(wrt);
-            inner(self.tape, &grads, tangents).tracked().grad_graph(wrt)
+            inner(self.tape, "hvp", &grads, tangents).tracked().grad_graph(wrt)
         });
         products.into_iter().map(Var::recorded_or_constant).collect()
     }
@@ -252,13 +253,15 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 }
 
-/// `sum_i a_i . v_i`.
+/// `sum_i a_i . v_i`, for the derivative `op` along the tangents v.
 #[track_caller]
-fn inner<'t, T: Scalar>(tape: &'t Tape<T>, a: &[Var<'t, T>], v: &[&Var<'t, T>]) -> Var<'t, T> {
-    assert_eq!(a.len(), v.len(), "as many tangents as variables");
+fn inner<'t, T: Scalar>(tape: &'t Tape<T>, op: &'static str, a: &[Var<'t, T>], v: &[&Var<'t, T>]) -> Var<'t, T> {
+    let count = || format!("{} tangents for {} variables", v.len(), a.len());
+    tape.fits(op, v, ensure(a.len() == v.len(), count));
     let mut total: Option<Var<'t, T>> = None;
     for (a, v) in a.iter().zip(v) {
-        assert_eq!(a.shape(), v.shape(), "a tangent has the shape of its variable");
+        let shape = || "a tangent has the shape of its variable".to_owned();
+        tape.fits(op, &[a, *v], ensure(a.shape() == v.shape(), shape));
         let product = (a * *v).sum();
         total = Some(match total {
             Some(total) => total + product,
@@ -278,7 +281,7 @@ fn unit<T: Scalar>(shape: &[usize], place: usize) -> Tensor<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Activation;
+    use crate::{Activation, Error};
     use std::slice::from_ref;
 
     fn vector(values: &[f64]) -> Tensor<f64> {
@@ -436,5 +439,22 @@ mod tests {
     #[should_panic(expected = "a tangent has the shape of its variable")]
     fn a_tangent_of_another_shape_is_refused() {
         jvp(|x| x[0].exp(), &[vector(&AT)], &[Tensor::scalar(1.0)]);
+    }
+
+    #[test]
+    fn tangents_that_do_not_fit_are_errors_of_shape() {
+        let tape = Tape::<f64>::new();
+        let (x, one) = (tape.leaf(vector(&AT)), tape.constant(Tensor::scalar(1.0)));
+        let named = |result: Result<Vec<Var<'_, f64>>, Error>, name: &str, text: &str| {
+            let error = result.unwrap_err();
+            assert!(
+                matches!(error, Error::Shape { op, .. } if op == name) && error.to_string().contains(text),
+                "{error}"
+            );
+        };
+        let shape = "a tangent has the shape of its variable";
+        named(tape.try_run(|| vec![x.exp().jvp(&[&x], &[&one])]), "jvp", shape);
+        named(tape.try_run(|| vec![x.exp().jvp(&[&x], &[])]), "jvp", "0 tangents for 1 variables");
+        named(tape.try_run(|| x.exp().sum().hvp(&[&x], &[&one])), "hvp", shape);
     }
 }
