@@ -207,7 +207,7 @@ impl Capture {
                 Ok(photo) => {
                     // A transparent border may be left by undistortion, so it is no sign of an empty background.
                     clear += usize::from(photo.transparent_share() > CLEAR);
-                    alpha += usize::from(photo.transparent_share() > 0.0);
+                    alpha += usize::from(photo.pixels().any(|pixel| pixel[3] < 1.0));
                     white += usize::from(!has_alpha && photo.white_border() > WHITE_BORDER);
                 }
                 Err(error) if has_alpha => return Err(name(error)),

@@ -488,7 +488,7 @@ fn opaque_alpha_is_no_empty_background() {
     let mut capture = capture(folder.path(), 4);
     capture.format = Format::Blender;
     // One transparent pixel is less than 5 %.
-    for (alpha, expected) in [(1.0, false), (0.5, false), (0.0, true)] {
+    for (alpha, expected) in [(1.0, false), (0.5, true), (0.0, true)] {
         for view in &capture.views {
             let Some(path) = &view.image else { continue };
             let mut image = Image { width: 12, height: 8, channels: 4, data: vec![0.3; 12 * 8 * 4] };
