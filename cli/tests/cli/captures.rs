@@ -110,7 +110,7 @@ pub fn apart(a: &Image, b: &Image) -> f32 {
 fn eval_uses_the_models_cameras() {
     let place = Place::with_scene();
     // A large learning rate, so that the refinement is visible.
-    let fast = r#"--set poses={"constant":{"rate":0.1}} --set camera_optimizer={"focal":{"constant":{"rate":0.02}}}"#;
+    let fast = r#"--set poses={"constant":{"rate":0.05}} --set camera_optimizer={"focal":{"constant":{"rate":0.02}}}"#;
     place.succeeds(&format!("train scene --steps 40 --out run {SMALL} {PLAIN} {fast}"));
     let model = model(&place, "run");
     let view = |camera: &Camera| model.render(camera, [1.0; 3]).color;
