@@ -141,6 +141,7 @@ mod tests {
         let close = |(a, b): (&f32, &f32)| (a - b).abs() <= 2e-7 * b.abs();
         assert!(run(true).iter().zip(&run(false)).all(close), "{:?} {:?}", run(true), run(false));
     }
+
     #[test]
     fn long_sums_of_a_row_keep_their_digits() {
         let tape = Tape::<f32>::new();
