@@ -141,6 +141,7 @@ fn image_of_other_shape_than_camera_is_an_error() {
         ([361, 270], [1440, 1083], false),
         ([120, 67], [1440, 815], true),
         ([120, 66], [1440, 815], false),
+        ([360, 2], [1440, 11], true),
     ] {
         assert_eq!(same_shape(size, &camera(of[0], of[1])), fits, "{size:?} for {of:?}");
     }

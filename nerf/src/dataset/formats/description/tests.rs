@@ -105,16 +105,20 @@ fn files_name_their_description() {
         assert_eq!(count(file), expected, "{file}");
     }
     assert_eq!(count("sparse/3"), 2, "a model's folder");
-    for (inside, root) in
-        [("colmap/sparse/0", ""), ("distorted/sparse/0", ""), ("sparse", ""), ("sparse/a", "sparse/a")]
-    {
-        let other = path.join("other").join(inside);
-        std::fs::create_dir_all(&other).unwrap();
+    // A model, what names its capture, and the capture's folder, which may be called `sparse` too.
+    for (model, named, folder) in [
+        ("a/colmap/sparse/0", "a/colmap/sparse/0", "a"),
+        ("b/distorted/sparse/0", "b/distorted/sparse/0", "b"),
+        ("c/sparse", "c/sparse", "c"),
+        ("sparse/garden/sparse/0", "sparse/garden", "sparse/garden"),
+        ("sparse/garden/sparse/0", "sparse/garden/sparse/0", "sparse/garden"),
+    ] {
+        let other = path.join("other");
+        std::fs::create_dir_all(other.join(model)).unwrap();
         for name in ["cameras.bin", "images.bin"] {
-            std::fs::copy(path.join("sparse/3").join(name), other.join(name)).unwrap();
+            std::fs::copy(path.join("sparse/3").join(name), other.join(model).join(name)).unwrap();
         }
-        let expected = if inside == "sparse/a" { path.join("other") } else { path.join("other").join(root) };
-        assert_eq!(read(&other, None).unwrap().folder, expected, "{inside}");
+        assert_eq!(read(&other.join(named), None).unwrap().folder, other.join(folder), "{named}");
     }
     let message = read(&path.join("some.json"), Some(Format::Llff)).unwrap_err().to_string();
     assert!(message.ends_with("some.json: describes a capture in the format transforms.json, not LLFF"), "{message}");
