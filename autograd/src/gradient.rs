@@ -3,8 +3,24 @@
 use crate::RowSums;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use std::any::Any;
+use std::borrow::Cow;
 use std::fmt;
 use std::sync::Arc;
+
+/// A sparse contribution as plain data, to send it to another process or to store it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SparseParts<T: Scalar> {
+    /// The name of its type, from which the receiver knows how to read it.
+    pub kind: Cow<'static, str>,
+    /// Its integers, such as the rows of a table.
+    pub integers: Arc<[u32]>,
+    /// Its numbers.
+    pub tensors: Vec<Tensor<T>>,
+}
+
+/// Makes a sparse contribution to the gradient of a variable of this shape from its parts. `None` if the parts do not
+/// fit the type or the shape: they may come from another program.
+pub type ReadSparse<T> = fn(shape: &[usize], parts: SparseParts<T>) -> Option<Arc<dyn SparseGrad<T>>>;
 
 /// A sparse contribution to a gradient. For a table with few used rows (an embedding, a hash grid), it is much smaller
 /// than the table.
@@ -31,6 +47,12 @@ pub trait SparseGrad<T: Scalar>: Any + Send + Sync {
     /// dense sum.
     fn is_passing(&self) -> bool {
         false
+    }
+
+    /// This contribution as plain data, from which its [`ReadSparse`] function makes one that adds the same bits.
+    /// `None`, the default, if it cannot be sent to another process.
+    fn to_parts(&self) -> Option<SparseParts<T>> {
+        None
     }
 }
 

@@ -51,7 +51,7 @@ pub use cases::{Cases, Extreme};
 pub use dual::Dual;
 pub use error::{Error, ShapeError};
 pub use formula::{Elementwise, Formula};
-pub use gradient::{Gradient, RowShare, SparseGrad};
+pub use gradient::{Gradient, ReadSparse, RowShare, SparseGrad, SparseParts};
 pub use memo::CachedOutputs;
 pub use number::{Number, Term};
 pub use op::{Grads, Op, Reads, Vjp};

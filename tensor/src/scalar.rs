@@ -44,13 +44,11 @@ pub trait Scalar:
     fn to_f64(self) -> f64;
     /// Whether the number is neither infinite nor NaN.
     fn is_finite(self) -> bool;
-    /// Appends the number as little-endian bytes, as in safetensors files.
-    fn write_le(self, out: &mut Vec<u8>);
-    /// Reads a number from little-endian bytes: the inverse of [`write_le`](Self::write_le).
-    ///
-    /// # Panics
-    /// If `bytes` has another length than the type.
-    fn read_le(bytes: &[u8]) -> Self;
+    /// Appends numbers as little-endian bytes, as in safetensors files.
+    fn write_le(values: &[Self], out: &mut Vec<u8>);
+    /// Reads numbers from little-endian bytes: the inverse of [`write_le`](Self::write_le). Bytes beyond the last whole
+    /// number are left out.
+    fn read_le(bytes: &[u8]) -> Vec<Self>;
 
     /// Flags of as many bits as the number, so that they share a vector's lanes. The highest bit is the flag.
     #[doc(hidden)]
@@ -111,13 +109,15 @@ macro_rules! scalar {
             fn is_finite(self) -> bool {
                 $t::is_finite(self)
             }
-            fn write_le(self, out: &mut Vec<u8>) {
-                out.extend_from_slice(&self.to_le_bytes());
+            fn write_le(values: &[Self], out: &mut Vec<u8>) {
+                let start = out.len();
+                out.resize(start + size_of_val(values), 0);
+                for (bytes, x) in out[start..].as_chunks_mut().0.iter_mut().zip(values) {
+                    *bytes = x.to_le_bytes();
+                }
             }
-            fn read_le(bytes: &[u8]) -> Self {
-                let mut le = [0; size_of::<$t>()];
-                le.copy_from_slice(bytes);
-                $t::from_le_bytes(le)
+            fn read_le(bytes: &[u8]) -> Vec<Self> {
+                bytes.as_chunks().0.iter().map(|bytes| $t::from_le_bytes(*bytes)).collect()
             }
 
             type Flags = $bits;

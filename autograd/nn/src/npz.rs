@@ -140,7 +140,7 @@ fn add<T: Scalar>(archive: &mut ZipArchiveWriter<&mut Vec<u8>>, name: &str, valu
         return Err("its name cannot be that of a file in an archive".into());
     }
     let mut bytes = header::<T>(value.shape());
-    value.as_slice().iter().for_each(|x| x.write_le(&mut bytes));
+    T::write_le(value.as_slice(), &mut bytes);
     store(archive, &file, &bytes).map_err(|error| error.to_string())
 }
 
@@ -257,7 +257,7 @@ fn parse<T: Scalar>(bytes: &[u8]) -> Result<Tensor<T>, What> {
     if data.len() != if shape.contains(&0) { 0 } else { size } {
         return Err(format!("holds {} bytes of elements, which is not what shape {shape:?} needs", data.len()));
     }
-    let values: Vec<T> = data.chunks_exact(size_of::<T>()).map(T::read_le).collect();
+    let values = T::read_le(data);
     let fortran = field(text, "fortran_order").ok_or_else(broken)?.starts_with("True");
     Ok(if fortran { from_columns(&shape, &values) } else { Tensor::from_vec(&shape, values) })
 }

@@ -55,12 +55,11 @@ impl Storage {
 
     fn write<T: Scalar>(self, values: &[T]) -> Vec<u8> {
         let mut out = Vec::with_capacity(size_of_val(values));
-        for &x in values {
-            match self {
-                Storage::Full => x.write_le(&mut out),
-                Storage::F16 => out.extend(f16::from_f64(x.to_f64()).to_le_bytes()),
-                Storage::Bf16 => out.extend(bf16::from_f64(x.to_f64()).to_le_bytes()),
-            }
+        let pairs = |pair: fn(f64) -> [u8; 2]| values.iter().flat_map(move |x| pair(x.to_f64()));
+        match self {
+            Storage::Full => T::write_le(values, &mut out),
+            Storage::F16 => out.extend(pairs(|x| f16::from_f64(x).to_le_bytes())),
+            Storage::Bf16 => out.extend(pairs(|x| bf16::from_f64(x).to_le_bytes())),
         }
         out
     }
@@ -68,7 +67,7 @@ impl Storage {
     pub(crate) fn read<T: Scalar>(self, bytes: &[u8]) -> Vec<T> {
         let pairs = || bytes.as_chunks().0.iter();
         match self {
-            Storage::Full => bytes.chunks_exact(size_of::<T>()).map(T::read_le).collect(),
+            Storage::Full => T::read_le(bytes),
             Storage::F16 => pairs().map(|&pair| T::from_f64(f16::from_le_bytes(pair).to_f64())).collect(),
             Storage::Bf16 => pairs().map(|&pair| T::from_f64(bf16::from_le_bytes(pair).to_f64())).collect(),
         }

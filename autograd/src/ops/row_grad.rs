@@ -1,7 +1,7 @@
 //! The sparse gradient of a table with few used rows.
 
 use super::pick::check_index;
-use crate::{RowShare, RowSums, SparseGrad};
+use crate::{RowShare, RowSums, SparseGrad, SparseParts};
 use raygrad_tensor::{Scalar, Shape, Tensor};
 use std::sync::Arc;
 
@@ -68,6 +68,17 @@ impl<T: Scalar> RowGrad<T> {
         &self.rows
     }
 
+    /// The name of its [parts](SparseGrad::to_parts).
+    pub const KIND: &'static str = "rows";
+
+    /// Reads a contribution from its [parts](SparseGrad::to_parts).
+    pub fn read(shape: &[usize], parts: SparseParts<T>) -> Option<Arc<dyn SparseGrad<T>>> {
+        let (index, [rows]) = (parts.integers, <[_; 1]>::try_from(parts.tensors).ok()?);
+        let fits = rows.shape().split_first() == Some((&index.len(), shape.get(1..)?));
+        let is_within = index.iter().all(|&row| (row as usize) < shape[0]);
+        (fits && is_within).then(|| Arc::new(RowGrad { shape: shape.into(), index, rows }) as Arc<dyn SparseGrad<T>>)
+    }
+
     #[track_caller]
     fn add(&self, dense: &mut [T]) {
         assert_eq!(dense.len(), self.shape.iter().product::<usize>(), "a dense gradient of the table");
@@ -87,6 +98,11 @@ impl<T: Scalar> SparseGrad<T> for RowGrad<T> {
 
     fn as_rows(&self) -> Option<&dyn RowShare<T>> {
         Some(self)
+    }
+
+    fn to_parts(&self) -> Option<SparseParts<T>> {
+        let (index, rows) = (self.index.clone(), self.rows.clone());
+        Some(SparseParts { kind: RowGrad::<T>::KIND.into(), integers: index, tensors: vec![rows] })
     }
 }
 

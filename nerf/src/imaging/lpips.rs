@@ -193,7 +193,7 @@ fn tensor(file: &SafeTensors<'_>, name: &str, shape: &[usize], least: f32) -> st
     if found.dtype() != Dtype::F32 || found.shape() != shape {
         return Err(format!("is {:?}{:?}, should be F32{shape:?}", found.dtype(), found.shape()));
     }
-    let values: Vec<f32> = found.data().chunks_exact(size_of::<f32>()).map(f32::read_le).collect();
+    let values = f32::read_le(found.data());
     match values.iter().find(|x| !(x.is_finite() && **x >= least)) {
         Some(x) if x.is_finite() => Err(format!("has the value {x}, should be at least 0")),
         Some(x) => Err(format!("has the value {x}, should be finite")),

@@ -142,7 +142,7 @@ impl Random {
     fn pattern<T: Scalar>(&mut self) -> f64 {
         loop {
             let bytes = self.bits().to_le_bytes();
-            let x = T::read_le(&bytes[..size_of::<T>()]).to_f64();
+            let x = T::read_le(&bytes[..size_of::<T>()])[0].to_f64();
             if x.is_finite() {
                 return x;
             }

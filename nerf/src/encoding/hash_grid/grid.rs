@@ -103,6 +103,7 @@ pub(super) const PRIMES: [u32; 2] = [2_654_435_761, 805_459_861];
 /// a cache line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HashGrid {
+    config: HashGridConfig,
     levels: Arc<[HashLevel]>,
     /// Rows of the table, and features per row.
     shape: [usize; 2],
@@ -128,7 +129,12 @@ impl HashGrid {
         };
         let levels: Arc<[HashLevel]> = (0..config.levels).map(level).collect();
         check_parameters(first * config.features)?;
-        Ok(HashGrid { levels, shape: [first, config.features] })
+        Ok(HashGrid { config: config.clone(), levels, shape: [first, config.features] })
+    }
+
+    /// Returns the configuration.
+    pub fn config(&self) -> &HashGridConfig {
+        &self.config
     }
 
     /// Returns the levels, coarsest first.
