@@ -30,9 +30,11 @@
 //! * [`Layer`] and the layers: [`Linear`], [`Mlp`], [`Conv2d`], [`LayerNorm`], [`Dropout`], [`Embedding`],
 //!   [`Sequential`].
 //! * [`Optimizer`]: [`Sgd`], [`Adam`], [`AdamW`]. Around it: [`Schedule`], [`clip_norm`], [`Ema`].
-//! * [`Tiles`]: a training step in parallel, with the same bits for any number of threads.
+//! * [`Tiles`]: a training step in parallel, with the same bits for any number of threads. With an [`Exchange`]:
+//!   on several machines.
 //! * [`OptimizerState`] and [`Params`] as files, with the feature `files`: safetensors, and NumPy's npz.
 
+mod exchange;
 #[cfg(feature = "files")]
 mod files;
 mod layers;
@@ -44,6 +46,9 @@ mod params;
 mod storage;
 mod tiles;
 
+#[cfg(feature = "mpi")]
+pub use exchange::Mpi;
+pub use exchange::{Exchange, ExchangeError, InProcess, Link, Simulated, Tcp};
 #[cfg(feature = "files")]
 pub use files::{TEMPORARY_PREFIX, create_folder, rename_durable, write_atomic};
 pub use layers::{Conv2d, Dropout, Embedding, Init, Layer, LayerNorm, Linear, Mlp, Mode, Sequential};

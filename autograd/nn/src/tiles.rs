@@ -1,24 +1,31 @@
-//! A training step in parallel tiles, with the same bits for any number of threads.
+//! A training step in parallel tiles, with the same bits for any number of threads and processes.
 
-use crate::{Bound, Params};
-use raygrad_autograd::{Gradient, SparseGrad, Tape, Var};
+use crate::exchange::{Exchange, ExchangeError, Frame, Reader};
+use crate::{Bound, ParamId, Params};
+use raygrad_autograd::{Gradient, ReadSparse, RowGrad, SparseGrad, SparseParts, Tape, Var};
 use raygrad_tensor::parallel::locked;
 use raygrad_tensor::{Pool, Scalar, Tensor, add_assign, parallel};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use std::collections::BTreeMap;
+use std::ops::Range;
 use std::sync::{Arc, Mutex};
 
-/// Number of slots. Gradients are summed within each slot and then in slot order. The number is fixed, so that sums do
-/// not depend on the number of threads; at most this many threads work at a time. In a step of this many tiles, each
-/// slot has one.
+/// Number of slots. Gradients are summed within each slot, then those of slots in pairs, the pairs in pairs, and so on.
+/// The number is fixed, so that sums do not depend on the number of threads and processes; at most this many threads
+/// work at a time. In a step of this many tiles, each slot has one.
 pub const SLOTS: usize = 8;
 
 /// Differentiates a training step in tiles, in parallel. A tile is a part of a batch that is small enough for the
 /// caches of a core. Each tile has its own tape, which is recorded, differentiated and cleared at once. The gradient of
 /// the step is the sum of the tiles' gradients.
 ///
-/// Tiles go to 8 slots in turn. A slot sums its tiles one after another, and the sums of the slots are added in order.
+/// Tiles go to 8 slots in turn. A slot sums its tiles one after another, and the sums of the slots are added in pairs.
 /// So the bits are the same for any number of threads. Sparse contributions are not summed, but stay in the order of
 /// the tiles. Tapes and scratch data (`S`) are kept from step to step, one for each thread at work. After the first
 /// steps no tensor-sized memory is allocated.
+///
+/// [`differentiate_across`](Self::differentiate_across) shares the tiles between processes.
 ///
 /// ```
 /// use raygrad_autograd::Tensor;
@@ -50,6 +57,8 @@ pub struct Tiles<T: Scalar, S = ()> {
     /// Tapes and scratch data that no thread is using.
     free: Mutex<Vec<(Tape<T>, S)>>,
     pool: Pool<T>,
+    /// How to read sparse contributions of other processes, by the names of their kinds.
+    readers: BTreeMap<&'static str, ReadSparse<T>>,
 }
 
 /// The result of a step.
@@ -63,10 +72,13 @@ pub struct TileSums<T: Scalar, R> {
 /// A sparse contribution and the number of its tile.
 type Share<T> = (usize, Arc<dyn SparseGrad<T>>);
 
+/// Whether this step has a dense sum, and its buffer.
+type Sum<T> = (bool, Option<Tensor<T>>);
+
 /// Sums over the tiles of one slot.
 struct Slot<T: Scalar> {
-    /// For each parameter that is not frozen: whether this step has a dense sum, and its buffer.
-    sums: Vec<(bool, Option<Tensor<T>>)>,
+    /// For each parameter that is not frozen: its sum.
+    sums: Vec<Sum<T>>,
     /// For each parameter that is not frozen, its sparse contributions.
     shares: Vec<Vec<Share<T>>>,
 }
@@ -81,7 +93,15 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
     /// An empty set of slots, without kept tapes.
     pub fn new() -> Self {
         let slot = || Slot { sums: vec![], shares: vec![] };
-        Tiles { slots: (0..SLOTS).map(|_| slot()).collect(), free: Mutex::default(), pool: Pool::new() }
+        let readers = BTreeMap::from([(RowGrad::<T>::KIND, RowGrad::read as ReadSparse<T>)]);
+        Tiles { slots: (0..SLOTS).map(|_| slot()).collect(), free: Mutex::default(), pool: Pool::new(), readers }
+    }
+
+    /// Reads sparse contributions of this [kind](SparseParts::kind) from other processes. That of
+    /// [`RowGrad`] is known.
+    pub fn with_reader(mut self, kind: &'static str, read: ReadSparse<T>) -> Self {
+        self.readers.insert(kind, read);
+        self
     }
 
     /// Computes the gradient of the sum of the losses of `count` tiles.
@@ -99,10 +119,85 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
         count: usize,
         loss: impl for<'t> Fn(usize, &Bound<'t, T>, &mut S) -> (Var<'t, T>, R) + Sync,
     ) -> TileSums<T, R> {
+        let results = self.run(params, count, 0..SLOTS, &loss);
+        self.add_pairs(|_| true);
+        let results = dealt(results).collect();
+        TileSums { grads: self.gradients(params), results }
+    }
+
+    /// As [`differentiate`](Self::differentiate), with the tiles shared between the processes of an exchange. Each
+    /// computes those of its slots and gets the gradient and the results of all, with the bits of a single process.
+    ///
+    /// All processes need the same parameters, and a loss that depends on the number of the tile and the parameters
+    /// alone. If they start with the same parameters and optimizer, they then make the same steps. More than 8
+    /// processes do not help: the others have no slot.
+    ///
+    /// What is sent: dense gradients as sums over slots, sparse ones as their [parts](SparseGrad::to_parts), and the
+    /// results.
+    ///
+    /// ```
+    /// use raygrad_autograd::Tensor;
+    /// use raygrad_nn::{Exchange, InProcess, Params, Tiles};
+    /// let train = |mut exchange: InProcess| {
+    ///     let mut params = Params::<f32>::new();
+    ///     let x = params.add("x", Tensor::from([1.0, 2.0]));
+    ///     let mut tiles = Tiles::<f32>::new();
+    ///     let step = tiles.differentiate_across(&mut exchange, &params, 10, |tile, params, ()| {
+    ///         ((&params[x] * tile as f64).square().sum(), tile)
+    ///     });
+    ///     let step = step.unwrap();
+    ///     (step.grads[0].dense().unwrap().as_slice().to_vec(), step.results)
+    /// };
+    /// let ranks: Vec<_> = InProcess::ranks(2).into_iter().map(|rank| std::thread::spawn(move || train(rank))).collect();
+    /// for rank in ranks {
+    ///     assert_eq!(rank.join().unwrap(), (vec![570.0, 1140.0], (0..10).collect()));
+    /// }
+    /// ```
+    ///
+    /// # Errors
+    /// If a process is lost, or works with other parameters or another number of tiles. If a sparse contribution cannot be
+    /// sent or read.
+    ///
+    /// # Panics
+    /// Where [`Var::backward`](Var::backward) panics.
+    #[track_caller]
+    pub fn differentiate_across<R: Send + Serialize + DeserializeOwned>(
+        &mut self,
+        exchange: &mut dyn Exchange,
+        params: &Params<T>,
+        count: usize,
+        loss: impl for<'t> Fn(usize, &Bound<'t, T>, &mut S) -> (Var<'t, T>, R) + Sync,
+    ) -> Result<TileSums<T, R>, ExchangeError> {
+        let (rank, ranks) = (exchange.rank(), exchange.ranks());
+        let own = slots_of(rank, ranks);
+        let mut results = self.run(params, count, own.clone(), &loss);
+        self.add_pairs(|pair| own.start <= pair.start && pair.end <= own.end);
+        let message = self.message(params, count, own, &results)?;
+        for (other, message) in exchange.all_gather(&message)?.iter().enumerate().filter(|(other, _)| *other != rank) {
+            self.receive(params, count, slots_of(other, ranks), &mut Reader(message), &mut results)
+                .map_err(|what| ExchangeError::Differs { rank: other, what })?;
+        }
+        let is_inside = |pair: &Range<usize>, rank| {
+            let own = slots_of(rank, ranks);
+            own.start <= pair.start && pair.end <= own.end
+        };
+        self.add_pairs(|pair| !(0..ranks).any(|rank| is_inside(&pair, rank)));
+        let results = dealt(results).collect();
+        Ok(TileSums { grads: self.gradients(params), results })
+    }
+
+    /// Differentiates the tiles of these slots. Returns the results of each slot, in the order of its tiles.
+    #[track_caller]
+    fn run<R: Send>(
+        &mut self,
+        params: &Params<T>,
+        count: usize,
+        slots: Range<usize>,
+        loss: &(impl for<'t> Fn(usize, &Bound<'t, T>, &mut S) -> (Var<'t, T>, R) + Sync),
+    ) -> Vec<Vec<R>> {
         let (free, wanted) = (&self.free, params.trainable().count());
-        let used = count.min(SLOTS);
+        self.slots.iter_mut().for_each(|slot| slot.begin(wanted));
         let work = |index: usize, slot: &mut Slot<T>| {
-            slot.begin(wanted);
             let (mut tape, mut scratch) = locked(free).pop().unwrap_or_default();
             let tiles = (index..count).step_by(SLOTS);
             let results: Vec<R> = tiles
@@ -113,47 +208,137 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
             locked(free).push((tape, scratch));
             results
         };
-        let mut results: Vec<Vec<R>> = (0..used).map(|_| vec![]).collect();
-        let slots = self.slots[..used].iter_mut().zip(&mut results);
-        parallel::each_of(slots, |index, (slot, results)| *results = work(index, slot));
-        // In the order of the tiles, which were dealt in turn.
-        let mut results: Vec<_> = results.into_iter().map(Vec::into_iter).collect();
-        let results = (0..count).filter_map(|tile| results[tile % SLOTS].next()).collect();
-        TileSums { grads: self.sums(params, used), results }
+        let mut results: Vec<Vec<R>> = (0..SLOTS).map(|_| vec![]).collect();
+        let used = slots.start..slots.end.min(count).max(slots.start);
+        let each = self.slots[used.clone()].iter_mut().zip(&mut results[used.clone()]);
+        parallel::each_of(each, |index, (slot, results)| *results = work(used.start + index, slot));
+        results
     }
 
-    /// Sums the slots in order, in parallel over parameters.
-    fn sums(&mut self, params: &Params<T>, used: usize) -> Vec<Gradient<T>> {
-        let shapes: Vec<_> = params.trainable().map(|id| params.get(id).shape()).collect();
-        let Some((first, rest)) = self.slots[..used].split_first_mut() else {
-            return shapes.into_iter().map(Gradient::zero).collect();
-        };
-        parallel::each_of(&mut first.sums, |i, (is_set, sum)| {
-            for (_, other) in rest.iter().map(|slot| &slot.sums[i]).filter(|(is_set, _)| *is_set) {
-                match (&mut *sum, other) {
-                    (Some(sum), Some(other)) if *is_set => add_assign(sum.as_mut_slice(), other.as_slice()),
-                    (Some(sum), Some(other)) if sum.shape() == other.shape() => {
-                        sum.as_mut_slice().copy_from_slice(other.as_slice());
+    /// Adds the sums of slots in pairs, the pairs in pairs, and so on, in parallel over parameters: those sums for whose
+    /// slots `which` is true.
+    fn add_pairs(&mut self, which: impl Fn(Range<usize>) -> bool + Sync) {
+        let mut columns: Vec<Vec<&mut Sum<T>>> = self.slots[0].sums.iter().map(|_| vec![]).collect();
+        for slot in &mut self.slots {
+            columns.iter_mut().zip(&mut slot.sums).for_each(|(column, sum)| column.push(sum));
+        }
+        parallel::each_of(columns, |_, mut column| {
+            for half in [1, 2, 4] {
+                for start in (0..SLOTS).step_by(2 * half).filter(|&start| which(start..start + 2 * half)) {
+                    let (before, after) = column.split_at_mut(start + half);
+                    let (sum, other) = (&mut *before[start], &mut *after[0]);
+                    match (&mut *sum, &mut *other) {
+                        ((true, Some(sum)), (is_set @ true, Some(other))) => {
+                            add_assign(sum.as_mut_slice(), other.as_slice());
+                            *is_set = false;
+                        }
+                        ((false, _), (true, _)) => std::mem::swap(sum, other),
+                        _ => {}
                     }
-                    (sum, other) => *sum = other.clone(),
                 }
-                *is_set = true;
             }
         });
-        let gradient = |(i, shape): (usize, &[usize])| {
-            let mut gradient = Gradient::zero(shape);
+    }
+
+    /// The sums of all slots, after [`add_pairs`](Self::add_pairs).
+    fn gradients(&mut self, params: &Params<T>) -> Vec<Gradient<T>> {
+        let gradient = |(i, id): (usize, ParamId)| {
+            let mut gradient: Gradient<T> = Gradient::zero(params.get(id).shape());
             if let (true, sum) = &mut self.slots[0].sums[i]
                 && let Some(sum) = sum.take()
             {
                 gradient.add_dense(sum);
             }
-            let mut shares: Vec<Share<T>> =
-                self.slots[..used].iter_mut().flat_map(|slot| slot.shares[i].drain(..)).collect();
+            let mut shares: Vec<Share<T>> = self.slots.iter_mut().flat_map(|slot| slot.shares[i].drain(..)).collect();
             shares.sort_by_key(|(tile, _)| *tile);
             shares.into_iter().for_each(|(_, share)| gradient.add_sparse(share));
             gradient
         };
-        shapes.into_iter().enumerate().map(gradient).collect()
+        params.trainable().enumerate().map(gradient).collect()
+    }
+
+    /// The results and gradients of these slots, for other processes.
+    fn message<R: Serialize>(
+        &self,
+        params: &Params<T>,
+        count: usize,
+        slots: Range<usize>,
+        results: &[Vec<R>],
+    ) -> Result<Vec<u8>, ExchangeError> {
+        let mut frame = Frame::default();
+        frame.number(count);
+        frame.number(params.trainable().count());
+        for slot in slots {
+            let results = postcard::to_allocvec(&results[slot])
+                .map_err(|error| ExchangeError::Connection(format!("a tile's result cannot be sent: {error}")))?;
+            frame.bytes(&results);
+            let Slot { sums, shares } = &self.slots[slot];
+            for ((sum, shares), id) in sums.iter().zip(shares).zip(params.trainable()) {
+                match sum {
+                    (true, Some(sum)) => {
+                        frame.number(1);
+                        frame.tensor(sum);
+                    }
+                    _ => frame.number(0),
+                }
+                frame.number(shares.len());
+                for (tile, share) in shares {
+                    let Some(SparseParts { kind, integers, tensors }) = share.to_parts() else {
+                        return Err(ExchangeError::NotSent { param: params.name(id).to_owned() });
+                    };
+                    frame.number(*tile);
+                    frame.bytes(kind.as_bytes());
+                    frame.integers(&integers);
+                    frame.number(tensors.len());
+                    tensors.iter().for_each(|tensor| frame.tensor(tensor));
+                }
+            }
+        }
+        Ok(frame.0)
+    }
+
+    /// Reads the [`message`](Self::message) of another process with these slots.
+    fn receive<R: DeserializeOwned>(
+        &mut self,
+        params: &Params<T>,
+        count: usize,
+        slots: Range<usize>,
+        reader: &mut Reader<'_>,
+        results: &mut [Vec<R>],
+    ) -> Result<(), String> {
+        let damaged = || "has sent a message that cannot be read; start all ranks with the same program".to_owned();
+        let [tiles, trainable] = [(); 2].map(|()| reader.number());
+        let own = [count, params.trainable().count()];
+        if [tiles, trainable] != own.map(Some) {
+            return Err(format!(
+                "has {tiles:?} tiles and {trainable:?} parameters in this step, and this rank has {own:?}"
+            ));
+        }
+        for slot in slots {
+            let bytes = reader.bytes().ok_or_else(damaged)?;
+            results[slot] = postcard::from_bytes(bytes).map_err(|_| damaged())?;
+            let tiles = (slot..count).step_by(SLOTS);
+            if results[slot].len() != tiles.len() {
+                return Err(damaged());
+            }
+            for (i, id) in params.trainable().enumerate() {
+                let (shape, name) = (params.get(id).shape(), params.name(id));
+                if reader.number().ok_or_else(damaged)? == 1 {
+                    let sum = reader.tensor().filter(|sum| sum.shape() == shape).ok_or_else(damaged)?;
+                    self.slots[slot].sums[i] = (true, Some(sum));
+                }
+                let shares = reader
+                    .sequence(share)
+                    .filter(|shares| shares.iter().all(|(tile, _)| *tile < count && tile % SLOTS == slot));
+                for (tile, parts) in shares.ok_or_else(damaged)? {
+                    let read = self.readers.get(&*parts.kind).ok_or_else(|| {
+                        format!("has sent a gradient of kind `{}` for `{name}`: add `Tiles::with_reader`", parts.kind)
+                    })?;
+                    self.slots[slot].shares[i].push((tile, read(shape, parts).ok_or_else(damaged)?));
+                }
+            }
+        }
+        if reader.0.is_empty() { Ok(()) } else { Err(damaged()) }
     }
 
     /// Reuses the memory of gradients for the next step.
@@ -169,6 +354,26 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
     pub fn trim(&self) {
         locked(&self.free).iter().for_each(|(tape, _)| tape.pool().trim());
     }
+}
+
+/// The slots of a rank.
+fn slots_of(rank: usize, ranks: usize) -> Range<usize> {
+    SLOTS * rank / ranks..SLOTS * (rank + 1) / ranks
+}
+
+/// The results of slots in the order of their tiles, which were dealt in turn.
+fn dealt<R>(results: Vec<Vec<R>>) -> impl Iterator<Item = R> {
+    let mut results: Vec<_> = results.into_iter().map(Vec::into_iter).collect();
+    (0..).map_while(move |tile: usize| results[tile % SLOTS].next())
+}
+
+/// Reads the number of a tile and its sparse contribution.
+fn share<T: Scalar>(reader: &mut Reader<'_>) -> Option<(usize, SparseParts<T>)> {
+    let tile = reader.number()?;
+    let kind = String::from_utf8(reader.bytes()?.to_vec()).ok()?.into();
+    let integers = reader.sequence(Reader::integer)?.into();
+    let tensors = reader.sequence(Reader::tensor)?;
+    Some((tile, SparseParts { kind, integers, tensors }))
 }
 
 impl<T: Scalar> Slot<T> {
@@ -217,7 +422,7 @@ impl<T: Scalar> Slot<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ParamId;
+    use crate::InProcess;
 
     /// Two matrices, and a table of which few rows are used.
     fn store() -> (Params<f32>, [ParamId; 3]) {
@@ -284,6 +489,100 @@ mod tests {
             assert_eq!(step.grads[0].dense().unwrap(), &Tensor::full(&shape, 20.0));
             tiles.take_back(step.grads);
         }
+    }
+
+    /// Gradients, results and sent bytes of two steps of 21 tiles on each of several ranks.
+    fn across(count: usize) -> Vec<(Vec<Vec<f32>>, Vec<f32>, u64)> {
+        let train = |mut exchange: InProcess| {
+            let (mut params, ids) = store();
+            let mut tiles = Tiles::<f32>::new();
+            let mut steps = (vec![], vec![], 0);
+            for tile_count in [21, 5] {
+                let TileSums { grads, results } = tiles
+                    .differentiate_across(&mut exchange, &params, tile_count, |tile, params, _| loss(tile, params, ids))
+                    .unwrap();
+                assert!(grads[2].is_rows() && grads[2].sparse().len() == tile_count);
+                for (grad, id) in grads.iter().zip(ids) {
+                    let dense = grad.clone().into_dense(&Pool::none());
+                    steps.0.push(dense.as_slice().to_vec());
+                    *params.get_mut(id) += &dense;
+                }
+                steps.1.extend(results);
+                tiles.take_back(grads);
+            }
+            (steps.0, steps.1, exchange.sent_bytes())
+        };
+        std::thread::scope(|scope| {
+            let start = |exchange| scope.spawn(move || train(exchange));
+            let ranks: Vec<_> = InProcess::ranks(count).into_iter().map(start).collect();
+            ranks.into_iter().map(|rank| rank.join().unwrap()).collect()
+        })
+    }
+
+    #[test]
+    fn tiles_any_processes_give_same_bits() {
+        let (mut params, ids) = store();
+        let mut tiles = Tiles::<f32>::new();
+        let mut expected = (vec![], vec![]);
+        for tile_count in [21, 5] {
+            let step = tiles.differentiate(&params, tile_count, |tile, params, _| loss(tile, params, ids));
+            for (grad, id) in step.grads.iter().zip(ids) {
+                let dense = grad.clone().into_dense(&Pool::none());
+                expected.0.push(dense.as_slice().to_vec());
+                *params.get_mut(id) += &dense;
+            }
+            expected.1.extend(step.results);
+        }
+        for count in [1, 2, 3, 4, 5, 8, 11] {
+            for (rank, (grads, results, sent)) in across(count).into_iter().enumerate() {
+                assert!((&grads, &results) == (&expected.0, &expected.1), "rank {rank} of {count}");
+                assert_eq!(sent > 0, count > 1);
+            }
+        }
+    }
+
+    #[test]
+    fn ranks_that_differ_are_named() {
+        let train = |mut exchange: InProcess, tile_count: usize| {
+            let (params, ids) = store();
+            let mut tiles = Tiles::<f32>::new();
+            let step = tiles
+                .differentiate_across(&mut exchange, &params, tile_count, |tile, params, _| loss(tile, params, ids));
+            step.err()
+        };
+        let errors: Vec<_> = std::thread::scope(|scope| {
+            let ranks: Vec<_> = InProcess::ranks(2)
+                .into_iter()
+                .map(|exchange| (3 + exchange.rank(), exchange))
+                .map(|(count, exchange)| scope.spawn(move || train(exchange, count)))
+                .collect();
+            ranks.into_iter().map(|rank| rank.join().unwrap()).collect()
+        });
+        for (rank, error) in errors.into_iter().enumerate() {
+            let Some(ExchangeError::Differs { rank: other, what }) = error else { panic!("{error:?}") };
+            assert!(other == 1 - rank && what.contains(&format!("has Some({}) tiles", 4 - rank)), "{what}");
+        }
+    }
+
+    #[test]
+    fn messages_hold_sums_and_cut_ones_are_refused() {
+        let (params, ids) = store();
+        let mut tiles = Tiles::<f32>::new();
+        let results = tiles.run(&params, 9, 0..4, &|tile, params, (): &mut ()| loss(tile, params, ids));
+        let message = tiles.message(&params, 9, 0..4, &results).unwrap();
+        let read = |message: &[u8]| {
+            let (mut tiles, mut results) = (Tiles::<f32>::new(), vec![Vec::<f32>::new(); SLOTS]);
+            tiles.slots.iter_mut().for_each(|slot| slot.begin(3));
+            tiles.receive(&params, 9, 0..4, &mut Reader(message), &mut results)
+        };
+        assert!(read(&message).is_ok());
+        for len in 0..message.len() {
+            assert!(read(&message[..len]).is_err(), "{len} bytes");
+        }
+        // Four slots have a sum of `a`, and one has one of `b`. Of sums over slots, one each is sent.
+        tiles.add_pairs(|pair| pair.end <= 4);
+        let summed = tiles.message(&params, 9, 0..4, &results).unwrap();
+        assert_eq!(message.len() - summed.len(), 3 * (8 * 3 + 4 * 18));
     }
 
     #[test]

@@ -1,0 +1,230 @@
+//! Ranks on several machines, connected by TCP.
+
+use super::{Exchange, ExchangeError, check_parts};
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{TcpListener, TcpStream, ToSocketAddrs};
+use std::sync::mpsc::{Sender, channel};
+use std::time::{Duration, Instant};
+
+/// Time between attempts to connect.
+const RETRY: Duration = Duration::from_millis(20);
+
+/// Ranks connected by TCP, where there is no MPI. Each pair of ranks has one connection.
+///
+/// Connections are neither encrypted nor authenticated: use it in a network whose machines are trusted.
+#[derive(Debug)]
+pub struct Tcp {
+    rank: usize,
+    /// The other ranks; `None` for this one.
+    peers: Vec<Option<Peer>>,
+    timeout: Duration,
+    sent: u64,
+}
+
+#[derive(Debug)]
+struct Peer {
+    incoming: TcpStream,
+    /// To the thread that writes, so that two ranks that send much to each other do not wait for one another.
+    outgoing: Sender<Vec<u8>>,
+}
+
+impl Tcp {
+    /// Connects rank `rank` of `addresses.len()` ranks. It listens at its own address, and waits up to `timeout` until all
+    /// others are there. Later it waits as long for each message.
+    ///
+    /// # Errors
+    /// If the own address cannot be listened at, or if not all others connect in time.
+    ///
+    /// # Panics
+    /// If `rank` has no address.
+    pub fn connect(rank: usize, addresses: &[impl ToSocketAddrs], timeout: Duration) -> Result<Self, ExchangeError> {
+        let failed = |what: &str, error| ExchangeError::Connection(format!("rank {rank}: {what}: {error}"));
+        let listener =
+            TcpListener::bind(&addresses[rank]).map_err(|error| failed("its address cannot be listened at", error))?;
+        Tcp::with_listener(rank, listener, addresses, timeout)
+    }
+
+    /// As [`connect`](Self::connect), with a bound listener in place of the own address.
+    ///
+    /// # Errors
+    /// If not all others connect in time.
+    pub fn with_listener(
+        rank: usize,
+        listener: TcpListener,
+        addresses: &[impl ToSocketAddrs],
+        timeout: Duration,
+    ) -> Result<Self, ExchangeError> {
+        let until = Instant::now() + timeout;
+        let absent = |other: usize, error: io::Error| {
+            let what = format!("rank {rank} cannot reach rank {other} within {} s: {error}", timeout.as_secs());
+            ExchangeError::Connection(what)
+        };
+        let mut peers: Vec<Option<Peer>> = addresses.iter().map(|_| None).collect();
+        // Each rank calls those before it, and says who it is.
+        for (other, address) in addresses[..rank].iter().enumerate() {
+            let stream = retry(until, || TcpStream::connect(address)).map_err(|error| absent(other, error))?;
+            let mut own = &stream;
+            own.write_all(&(rank as u64).to_le_bytes()).map_err(|error| absent(other, error))?;
+            peers[other] = Some(Peer::new(stream, timeout).map_err(|error| absent(other, error))?);
+        }
+        for _ in rank + 1..addresses.len() {
+            let missing = || (rank + 1..addresses.len()).find(|&other| peers[other].is_none()).unwrap_or(rank);
+            let (other, stream) = retry(until, || accept(&listener)).map_err(|error| absent(missing(), error))?;
+            if other <= rank || other >= addresses.len() || peers[other].is_some() {
+                let what = format!("rank {rank}: another program, or a second rank {other}, connects to its address");
+                return Err(ExchangeError::Connection(what));
+            }
+            peers[other] = Some(Peer::new(stream, timeout).map_err(|error| absent(other, error))?);
+        }
+        Ok(Tcp { rank, peers, timeout, sent: 0 })
+    }
+}
+
+/// Tries until it works or the time is over.
+fn retry<R>(until: Instant, mut attempt: impl FnMut() -> io::Result<R>) -> io::Result<R> {
+    loop {
+        match attempt() {
+            Err(_) if Instant::now() < until => std::thread::sleep(RETRY),
+            result => return result,
+        }
+    }
+}
+
+/// Accepts a connection, and reads which rank it is, without waiting for one.
+fn accept(listener: &TcpListener) -> io::Result<(usize, TcpStream)> {
+    listener.set_nonblocking(true)?;
+    let (mut stream, _) = listener.accept()?;
+    stream.set_nonblocking(false)?;
+    stream.set_read_timeout(Some(Duration::from_secs(1)))?;
+    let mut rank = [0; 8];
+    stream.read_exact(&mut rank)?;
+    Ok((u64::from_le_bytes(rank) as usize, stream))
+}
+
+impl Peer {
+    fn new(incoming: TcpStream, timeout: Duration) -> io::Result<Self> {
+        incoming.set_nodelay(true)?;
+        incoming.set_read_timeout(Some(timeout))?;
+        let mut writer = incoming.try_clone()?;
+        let (outgoing, messages) = channel::<Vec<u8>>();
+        // It ends with the sender. If the connection breaks, the reader notices.
+        std::thread::spawn(move || messages.iter().try_for_each(|message| writer.write_all(&message)));
+        Ok(Peer { incoming, outgoing })
+    }
+
+    fn receive(&mut self) -> io::Result<Vec<u8>> {
+        let mut len = [0; 8];
+        self.incoming.read_exact(&mut len)?;
+        let (len, mut message) = (u64::from_le_bytes(len), vec![]);
+        if (&self.incoming).take(len).read_to_end(&mut message)? as u64 != len {
+            return Err(ErrorKind::UnexpectedEof.into());
+        }
+        Ok(message)
+    }
+}
+
+impl Exchange for Tcp {
+    fn rank(&self) -> usize {
+        self.rank
+    }
+
+    fn ranks(&self) -> usize {
+        self.peers.len()
+    }
+
+    fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
+        check_parts(parts, self.ranks());
+        for (peer, part) in self.peers.iter().zip(parts) {
+            let Some(peer) = peer else { continue };
+            let message = [&(part.len() as u64).to_le_bytes(), *part].concat();
+            self.sent += part.len() as u64;
+            // A rank that has ended is found below.
+            let _ = peer.outgoing.send(message);
+        }
+        let after = self.timeout;
+        let receive = |(rank, peer): (usize, &mut Option<Peer>)| {
+            let Some(peer) = peer else { return Ok(parts[rank].to_vec()) };
+            peer.receive().map_err(|error| match error.kind() {
+                ErrorKind::WouldBlock | ErrorKind::TimedOut => ExchangeError::TimedOut { rank, after },
+                ErrorKind::UnexpectedEof => ExchangeError::Lost { rank, what: "it has closed its connection".into() },
+                _ => ExchangeError::Lost { rank, what: error.to_string() },
+            })
+        };
+        self.peers.iter_mut().enumerate().map(receive).collect()
+    }
+
+    fn sent_bytes(&self) -> u64 {
+        self.sent
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TIMEOUT: Duration = Duration::from_secs(20);
+
+    /// Runs ranks on threads, each with its connections, and returns their results.
+    fn on_ranks<R: Send>(count: usize, timeout: Duration, run: impl Fn(Tcp) -> R + Sync) -> Vec<R> {
+        let listeners: Vec<_> = (0..count).map(|_| TcpListener::bind("127.0.0.1:0").unwrap()).collect();
+        let addresses: Vec<_> = listeners.iter().map(|listener| listener.local_addr().unwrap()).collect();
+        std::thread::scope(|scope| {
+            let start = |(rank, listener)| {
+                let (run, addresses) = (&run, &addresses);
+                scope.spawn(move || run(Tcp::with_listener(rank, listener, addresses, timeout).unwrap()))
+            };
+            let ranks: Vec<_> = listeners.into_iter().enumerate().map(start).collect();
+            ranks.into_iter().map(|rank| rank.join().unwrap()).collect()
+        })
+    }
+
+    #[test]
+    fn large_messages_cross_and_stay_in_order() {
+        let message = |from: usize, to: usize, round: usize| vec![(10 * from + to + round) as u8; 3_000_000 * round];
+        on_ranks(3, TIMEOUT, |mut tcp| {
+            for round in 0..3 {
+                let parts: Vec<Vec<u8>> = (0..3).map(|to| message(tcp.rank(), to, round)).collect();
+                let parts: Vec<&[u8]> = parts.iter().map(|part| &part[..]).collect();
+                let expected: Vec<_> = (0..3).map(|from| message(from, tcp.rank(), round)).collect();
+                assert!(tcp.all_to_all(&parts).unwrap() == expected, "round {round}");
+            }
+            assert_eq!(tcp.sent_bytes(), 2 * 3_000_000 * 3);
+        });
+    }
+
+    #[test]
+    fn ranks_that_end_or_hang_are_named() {
+        let errors = on_ranks(3, TIMEOUT, |mut tcp| {
+            tcp.all_gather(&[1]).unwrap();
+            if tcp.rank() == 1 { None } else { Some(tcp.all_gather(&[2]).unwrap_err().to_string()) }
+        });
+        assert!(errors[0].as_deref().unwrap().starts_with("rank 1 has ended"), "{errors:?}");
+        let (hold, held) = channel::<()>();
+        let held = std::sync::Mutex::new(Some(held));
+        let hold = std::sync::Mutex::new(Some(hold));
+        let errors = on_ranks(2, Duration::from_secs(1), |mut tcp| {
+            if tcp.rank() == 1 {
+                // Stays until rank 0 has given up.
+                let held = held.lock().unwrap().take().unwrap();
+                let _ = held.recv();
+                return None;
+            }
+            let error = tcp.all_gather(&[2]).unwrap_err();
+            drop(hold.lock().unwrap().take());
+            Some(error)
+        });
+        assert_eq!(errors[0], Some(ExchangeError::TimedOut { rank: 1, after: Duration::from_secs(1) }));
+    }
+
+    #[test]
+    fn absent_ranks_are_named() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        let alone = Tcp::with_listener(0, listener, &[address, address], Duration::from_millis(50)).unwrap_err();
+        assert!(alone.to_string().contains("cannot reach rank 1 within"), "{alone}");
+        // Nobody listens at a port that has just been closed.
+        let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
+        let alone = Tcp::connect(1, &[&closed, "127.0.0.1:0"], Duration::from_millis(50)).unwrap_err();
+        assert!(alone.to_string().contains("rank 1 cannot reach rank 0"), "{alone}");
+    }
+}
