@@ -3,7 +3,7 @@
 use rand::{Rng, RngExt};
 
 /// A mask of the pixels of an image that training and evaluation use.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Mask {
     width: usize,
     height: usize,

@@ -8,6 +8,7 @@ use crate::memory::{available_memory, gigabytes};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
 use std::fs::File;
+use std::hash::{Hash, Hasher};
 use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
@@ -41,6 +42,18 @@ enum Values {
     Bytes(Vec<u8>),
     Words(Vec<u16>),
     Floats(Vec<f32>),
+}
+
+impl Photo {
+    /// Adds the size and all values to a hash.
+    pub(crate) fn hash_values(&self, hasher: &mut impl Hasher) {
+        [self.width, self.height, self.channels].hash(hasher);
+        match &self.values {
+            Values::Bytes(bytes) => hasher.write(bytes),
+            Values::Words(words) => words.hash(hasher),
+            Values::Floats(floats) => floats.iter().for_each(|x| hasher.write_u32(x.to_bits())),
+        }
+    }
 }
 
 impl From<Image> for Photo {

@@ -3,6 +3,7 @@
 //! Start with [`Trainer`]; the crate's landing page has an example. [`Budget`] is the length of a run, and
 //! [`fitted_cameras`] aligns held-out cameras to a trained model.
 
+mod across;
 mod fitted;
 pub(crate) mod groups;
 pub(crate) mod pass;

@@ -13,10 +13,11 @@ use crate::volume::query::Query;
 use crate::volume::render::{Evaluations, Rendered};
 use raygrad_autograd::{Scalar, Var};
 use raygrad_nn::Bound;
+use serde::{Deserialize, Serialize};
 use std::ops::Add;
 
 /// Counts and errors, summed over rays.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 pub(crate) struct Work {
     /// Samples placed on rays.
     pub marched: u64,

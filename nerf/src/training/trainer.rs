@@ -1,5 +1,6 @@
 //! The trainer: tiles of rays on all cores, with the same bits on any number of threads.
 
+use super::across::Across;
 use super::groups::Groups;
 use super::pass::{Work, rays_loss};
 use super::startup;
@@ -7,6 +8,7 @@ use super::stats::{Budget, StepStats};
 use crate::camera::Camera;
 use crate::dataset::batch::Batch;
 use crate::dataset::{Dataset, SceneType};
+use crate::encoding::hash_grid::HashGrad;
 use crate::imaging::metrics::psnr_from_mse;
 use crate::model::config::Config;
 use crate::model::{Model, POSES, SceneBox, densities};
@@ -14,7 +16,7 @@ use crate::random::{Jitter, stream};
 use crate::sampling::{BatchSize, Progress};
 use crate::{Error, Result};
 use raygrad_autograd::{Error as GraphError, Pool, Tape, Var};
-use raygrad_nn::{Bound, SLOTS, Tiles};
+use raygrad_nn::{Bound, Exchange, ExchangeError, SLOTS, Tiles};
 use std::ops::{Add, ControlFlow};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -38,6 +40,8 @@ pub struct Trainer {
     data: Arc<Dataset>,
     pub(super) groups: Groups,
     tiles: Tiles<f32>,
+    /// Other processes that train this model.
+    pub(super) across: Option<Across>,
     /// Memory for work outside of tiles.
     pool: Pool<f32>,
     /// Rays of the next step.
@@ -50,6 +54,11 @@ pub struct Trainer {
     /// The lr scale.
     pub(super) lr_scale: f64,
     pub(super) done: StepStats,
+}
+
+/// Tiles that read the table gradients of other processes.
+fn new_tiles() -> Tiles<f32> {
+    Tiles::new().with_reader(HashGrad::<f32>::KIND, HashGrad::read)
 }
 
 /// The rays of a step, drawn tile by tile.
@@ -132,7 +141,8 @@ impl Trainer {
         data.check_distances(model.loss_terms.iter().any(|term| term.needs_distances()))?;
         let mut trainer = Trainer {
             groups: Groups::new(&model.config, &model.params)?,
-            tiles: Tiles::new(),
+            tiles: new_tiles(),
+            across: None,
             pool: Pool::new(),
             batch: match model.sampler.batch_size() {
                 BatchSize::Rays { step, .. } => step,
@@ -172,11 +182,45 @@ impl Trainer {
         self.done
     }
 
+    /// Shares all further steps with other processes. Each has a trainer with the same configuration, images and
+    /// [state](Self::state), and calls the same methods. The steps have the bits of a single process.
+    ///
+    /// A [time budget](Budget::Time) is counted by rank 0. A run ends in all processes if one of them breaks it. If a
+    /// process is lost, [`run`](Self::run) ends, and [`exchange_error`](Self::exchange_error) says why.
+    ///
+    /// # Errors
+    /// If a process is lost, or differs from rank 0. The error says in what. Then nothing is shared.
+    pub fn share(&mut self, exchange: Box<dyn Exchange>) -> Result<()> {
+        self.across = Some(Across::new(exchange, &self.model, &self.data, (self.done.step, self.batch))?);
+        Ok(())
+    }
+
+    /// The exchange with the other processes, if steps are [shared](Self::share): for messages between runs.
+    pub fn exchange_mut(&mut self) -> Option<&mut dyn Exchange> {
+        match &mut self.across {
+            Some(across) => Some(&mut *across.exchange),
+            None => None,
+        }
+    }
+
+    /// The reason that a [shared](Self::share) run has ended early.
+    pub fn exchange_error(&self) -> Option<&ExchangeError> {
+        self.across.as_ref()?.error.as_ref()
+    }
+
+    /// Agrees with the other processes on the training time and on whether the run goes on.
+    fn agrees_to_go_on(&mut self) -> bool {
+        let Some(across) = &mut self.across else { return true };
+        let agreed = across.begin(self.done.step, self.elapsed);
+        self.elapsed = agreed.unwrap_or(self.elapsed);
+        agreed.is_some()
+    }
+
     /// Trains until the budget is used up, `observe` breaks, or the run has [diverged](StepStats::has_diverged).
     ///
     /// `observe` is called after every step; its time does not count.
     pub fn run(&mut self, budget: Budget, mut observe: impl FnMut(&Trainer) -> ControlFlow<()>) {
-        loop {
+        while self.agrees_to_go_on() {
             let fraction = match budget {
                 Budget::Steps(steps) => self.done.step as f64 / steps.max(1) as f64,
                 Budget::Time(time) => self.elapsed.as_secs_f64() / time.as_secs_f64().max(1e-9),
@@ -185,13 +229,20 @@ impl Trainer {
                 break;
             }
             self.step(fraction);
-            if observe(self).is_break() || self.done.has_diverged() {
+            let breaks = observe(self).is_break();
+            match &mut self.across {
+                // The others learn of it before the next step.
+                Some(across) if across.error.is_none() => across.stops = breaks,
+                _ if breaks => break,
+                _ => {}
+            }
+            if self.done.has_diverged() {
                 break;
             }
         }
         let start = (self.clock)();
         // Frees the memory of steps before the last grid update, which needs its own.
-        (self.tiles, self.pool) = (Tiles::new(), Pool::new());
+        (self.tiles, self.pool) = (new_tiles(), Pool::new());
         // A model with non-finite parameters cannot update the grid.
         if !self.done.has_diverged() {
             self.model.finish();
@@ -200,7 +251,8 @@ impl Trainer {
         self.elapsed += (self.clock)().saturating_sub(start);
     }
 
-    /// Performs one training step; `fraction` of the run (0 to 1) sets the schedules.
+    /// Performs one training step; `fraction` of the run (0 to 1) sets the schedules. If the step is
+    /// [shared](Self::share) and a process is lost, the parameters and the statistics stay as they are.
     pub fn step(&mut self, fraction: f64) -> StepStats {
         self.check_poses(fraction);
         let start = (self.clock)();
@@ -210,13 +262,26 @@ impl Trainer {
         }
         // After a restart, steps of the new model count.
         self.update_sampler(&Progress { step: self.groups.steps() + 1, train_frac: fraction, seed: self.seed() });
-        let mut tiles = std::mem::take(&mut self.tiles);
+        let (mut tiles, mut across) = (std::mem::take(&mut self.tiles), self.across.take());
         let draw = self.draw(fraction);
         let number = draw.number;
-        let step = tiles.differentiate(&self.model.params, draw.tiles(), |which, params, ()| draw.loss(which, params));
+        let (params, count) = (&self.model.params, draw.tiles());
+        let step = match &mut across {
+            None => Ok(tiles.differentiate(params, count, |which, params, ()| draw.loss(which, params))),
+            Some(Across { exchange, .. }) => {
+                tiles.differentiate_across(&mut **exchange, params, count, |which, params, ()| draw.loss(which, params))
+            }
+        };
+        let step = match step {
+            Ok(step) => step,
+            Err(error) => {
+                (self.tiles, self.across) = (tiles, across.map(|across| Across { error: Some(error), ..across }));
+                return self.done;
+            }
+        };
         let report = self.groups.update(&mut self.model.params, &step.grads, fraction, self.lr_scale);
         tiles.take_back(step.grads);
-        self.tiles = tiles;
+        (self.tiles, self.across) = (tiles, across);
         if number.is_multiple_of(TRIM_EVERY) {
             self.tiles.trim();
             self.pool.trim();

@@ -1,5 +1,7 @@
 //! Steps, restarts and the ends of runs.
 
+mod across;
+
 use super::*;
 use crate::dataset::{
     Background, Split,
