@@ -29,6 +29,7 @@ mod precision;
 mod prepare;
 mod preview;
 mod progress;
+mod ranks;
 #[cfg(test)]
 mod reference;
 mod render;
@@ -49,7 +50,7 @@ use raygrad::nerf::{Error, Result};
 use raygrad::tensor::simd;
 
 use interrupt::{Stop, Work};
-use output::{complain, print};
+use output::{complain_of, print};
 use train::Trained;
 
 /// Help text on exit codes.
@@ -94,18 +95,26 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
-    run(cli).unwrap_or_else(|stop| match stop {
-        Stop::Interrupted => interrupt::EXIT_CODE.into(),
-        Stop::Failed(error) => {
-            complain(&error.to_string());
+    let code = match run(Cli::parse()) {
+        Ok(code) => code,
+        Err(Stop::Interrupted) => interrupt::EXIT_CODE.into(),
+        Err(Stop::Failed(error)) => {
+            complain_of(&error);
+            ranks::fail();
             ExitCode::FAILURE
         }
-    })
+    };
+    ranks::finish();
+    code
 }
 
 fn run(cli: Cli) -> Work<ExitCode> {
     simd::check_environment().map_err(|what| Error::setting("environment", what))?;
+    match &cli.command {
+        Some(Command::Train(args)) => ranks::start(Some(args.rank_timeout), cli.threads.is_some())?,
+        None | Some(Command::Render(_) | Command::Eval(_)) => ranks::start(None, cli.threads.is_some())?,
+        _ => ranks::refuse()?,
+    }
     if let Some(threads) = cli.threads {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
         pool.map_err(|e| Error::setting("threads", e))?;

@@ -8,7 +8,7 @@ use super::interrupt::{self, Work};
 use super::output::{entries, print};
 use super::prepare::convert;
 use super::shard::{self, Complete, Progress, Shard};
-use super::{eval, render};
+use super::{eval, ranks, render};
 
 /// Merge shards of `render`, `eval` or `prepare`
 ///
@@ -43,8 +43,12 @@ pub fn run(args: &Args) -> Work<()> {
     Err(Error::file(out, what).into())
 }
 
-/// Merges the shards in a folder of results if all are complete. Called after `shard` is.
+/// Merges the shards in a folder of results if all are complete. Called after `shard` is. Of several ranks, rank 0
+/// merges them when all are here.
 pub fn merge_if_complete(at: &Path, shard: Shard) -> Work<()> {
+    if !ranks::wait()? {
+        return Ok(());
+    }
     let rest = match shard::progress(at)? {
         Progress::Complete(complete) => return merge(*complete),
         Progress::None => "another raygrad has merged the shards".into(),

@@ -7,8 +7,13 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::imaging::colormap;
 use raygrad::nerf::{Error, Image, Render, Result, create_folder};
 
-/// Writes to standard output. A closed pipe (`raygrad eval run | head -1`) or a closed terminal is not an error.
+use super::ranks;
+
+/// Writes to standard output, on rank 0 alone. A closed pipe (`raygrad eval run | head -1`) or a closed terminal is not an error.
 pub fn print(text: &str) -> Result<()> {
+    if ranks::is_silent() {
+        return Ok(());
+    }
     let text = printable(text);
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
@@ -37,8 +42,14 @@ fn is_device<T>(_: &T) -> bool {
     false
 }
 
-/// Writes a line to standard error. Ignores errors, unlike `eprintln`, which panics if standard error is closed.
+/// Writes a line to standard error, on rank 0 alone. Ignores errors, unlike `eprintln`, which panics if standard error is closed.
 pub fn note(line: &str) {
+    if !ranks::is_silent() {
+        write(line);
+    }
+}
+
+fn write(line: &str) {
     let _ = writeln!(std::io::stderr(), "{}", printable(line));
 }
 
@@ -63,6 +74,12 @@ fn printable(text: &str) -> Cow<'_, str> {
 /// Writes a warning or an error to standard error.
 pub fn complain(line: &str) {
     note(&format!("raygrad: {line}"));
+}
+
+/// Writes the error that ends this process to standard error, with the rank if there are several.
+pub fn complain_of(error: &Error) {
+    let rank = ranks::own().map_or(String::new(), |(rank, _)| format!("rank {rank}: "));
+    write(&format!("raygrad: {rank}{error}"));
 }
 
 /// The parent folder of a file.

@@ -19,12 +19,12 @@ use super::interrupt::{self, Stop, Work};
 use super::merge;
 use super::output::{check_writable, checksum, note, other_numbered, parent, print};
 use super::overwrite::{Job, png_with_text};
-use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::{Progress, spoken};
 use super::run::{Run, check_output};
 use super::scene::Scene;
 use super::shard::{Complete, Shard, Whole};
+use super::{parse, ranks};
 use camera_motion::{CameraMotion, CameraPath, CameraPathArgs};
 use frames::{DIGITS, Frames};
 use shown::{Layer, Show, Shown};
@@ -202,6 +202,7 @@ pub fn run(args: &Args) -> Work<()> {
     let renderer = Renderer::new(model, args.precision)?;
     let shown = Shown { renderer: &renderer, extent, background, show, save: &args.save, depth_unit };
     let folder = match kind {
+        Kind::Png if ranks::is_silent() => return Ok(()),
         Kind::Png => {
             check_writable(parent(&out))?;
             let picture = shown.frame(&cameras[0]).image.to_png();
@@ -218,7 +219,8 @@ pub fn run(args: &Args) -> Work<()> {
     let of = contents(args, stored, &cameras, &shown)?;
     let size = [cameras[0].width, cameras[0].height];
     let output = Output { kind, frames: cameras.len(), size, fps, keep_frames: args.keep_frames };
-    let mut frames = match args.shard {
+    let shard = args.shard.or_else(ranks::shard);
+    let mut frames = match shard {
         None => Frames::new(folder, of, &job, cameras.len(), &args.save)?,
         Some(shard) => {
             let inputs = json!(Inputs { arguments, of, output: output.clone() });
@@ -237,7 +239,7 @@ pub fn run(args: &Args) -> Work<()> {
         frames.stopped(AGAIN)?;
     }
     rendered?;
-    let Some(shard) = args.shard else { return output.complete(frames, &job, &out, AGAIN) };
+    let Some(shard) = shard else { return output.complete(frames, &job, &out, AGAIN) };
     let folder = frames.folder().to_owned();
     frames.keep();
     merge::merge_if_complete(&folder, shard)

@@ -57,6 +57,11 @@ impl fmt::Display for Shard {
 }
 
 impl Shard {
+    /// Shard `number`, from 1, of `count`.
+    pub fn new(number: usize, count: usize) -> Self {
+        Shard { number, count }
+    }
+
     /// The items of this shard, of `total`. They are interleaved, because neighbours take similar times.
     pub fn items(self, total: usize) -> impl ExactSizeIterator<Item = usize> {
         (self.number - 1..total).step_by(self.count)

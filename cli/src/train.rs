@@ -14,6 +14,7 @@ use raygrad::nerf::dataset::{AutomaticDownscale, Dataset, DownscaleLimit, Format
 use raygrad::nerf::model::RefinedParam;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Error, Preset, Result, StepStats, Trainer, available_memory};
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::interrupt::Work;
@@ -27,7 +28,7 @@ use super::scene::{Opened, Scene};
 use super::summary::Ended;
 use super::view::{Listener, PlaceArgs, TrainingViewer};
 use super::watch::Watch;
-use super::{checkpoint, doctor, interrupt, machine, memory, parse, watch};
+use super::{checkpoint, doctor, interrupt, machine, memory, parse, ranks, watch};
 use config::set_near;
 
 #[cfg(test)]
@@ -180,6 +181,12 @@ pub struct Args {
     /// total, counted from the start of the run.
     #[arg(long, help_heading = "Time", value_name = "RUN", conflicts_with_all = NEW)]
     resume: Option<PathBuf>,
+    /// How long MPI ranks wait for one another
+    ///
+    /// After this time without a message from a rank, the run ends with its number. It must be longer than rank 0
+    /// needs to render a preview and to save.
+    #[arg(long, help_heading = "Time", value_name = "TIME", value_parser = parse::duration, default_value = "10m")]
+    pub rank_timeout: Duration,
     /// Time between checkpoints
     ///
     /// Measured in training time. --resume continues from the last checkpoint.
@@ -258,6 +265,9 @@ pub fn run(args: &Args) -> Work<Trained> {
         return Err(Error::setting("view", "is missing: --host and --port need --view").into());
     }
     // Binds the port first, before files are created.
+    if ranks::is_silent() {
+        return follow();
+    }
     let listener = args.view.then(|| args.place.listen()).transpose()?;
     match &args.resume {
         None => begin(args, listener),
@@ -307,14 +317,51 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     Ok(train((run, lock), trainer, args.budget(), args, preview, listener)?)
 }
 
-/// Resumes a run from its last checkpoint.
-fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trained> {
-    let mut run = Run::open(folder)?;
+/// What rank 0 tells the others.
+#[derive(Serialize, Deserialize)]
+struct Shared {
+    folder: PathBuf,
+    config: RunConfig,
+    budget: Budget,
+}
+
+/// Shares the training of a run with the other ranks, if there are any.
+fn share(trainer: &mut Trainer, run: &Run, budget: Budget) -> Result<()> {
+    let Some(mut exchange) = ranks::take() else { return Ok(()) };
+    let shared = Shared { folder: run.folder.clone(), config: run.config.clone(), budget };
+    ranks::of_first(&mut *exchange, Some(&shared))?;
+    ranks::bytes_of_first(&mut *exchange, &trainer.state()?)?;
+    print(&format!("ranks    {}, connected by MPI\n", exchange.ranks()))?;
+    trainer.share(exchange)
+}
+
+/// Trains the run of rank 0. It writes nothing.
+fn follow() -> Work<Trained> {
+    let lost = || Error::setting("mpi", "this rank has no connection to the others");
+    let mut exchange = ranks::take().ok_or_else(lost)?;
+    let Shared { folder, config, budget } = ranks::of_first(&mut *exchange, None)?;
+    let state = ranks::bytes_of_first(&mut *exchange, &[])?;
+    let (_, _, mut trainer) = reopen(&Run { folder: folder.clone(), config })?;
+    trainer.load_state(&state)?;
+    trainer.share(exchange)?;
+    interrupt::listen();
+    loop {
+        trainer
+            .run(budget, |_| if interrupt::requested() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) });
+        let interrupted = ranks::any_is_interrupted(&mut trainer, interrupt::requested()).map_err(ranks::failed)?;
+        // Rank 0 goes back to a checkpoint if the run has diverged.
+        let state = trainer.exchange_mut().map_or(Ok(vec![]), |exchange| ranks::bytes_of_first(exchange, &[]))?;
+        if state.is_empty() {
+            let diverged = trainer.stats().ends_diverged();
+            return Ok(Trained { folder, interrupted, diverged });
+        }
+        trainer.load_state(&state)?;
+    }
+}
+
+/// Loads the images of a run and makes a trainer of its configuration, at step 0.
+fn reopen(run: &Run) -> Result<(Opened, Arc<Dataset>, Trainer)> {
     let RunConfig { scene_box: extent, downscale, config, .. } = run.config.clone();
-    let budget = match (args.given(), run.config.budget) {
-        (Some(budget), _) | (None, Some(budget)) => budget,
-        (None, None) => return Err(Error::setting("budget", "the run has none: add --budget or --steps")),
-    };
     let mut scene = run.open_scene(None)?;
     scene.depth = config.loss_terms.iter().any(|term| term.kind() == "depth");
     let data = scene.load(Split::Train, downscale, usize::MAX)?;
@@ -326,10 +373,22 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
             "the run was trained on other images than {} has now: restore those, or train a new run",
             run.config.scene
         );
-        return Err(Error::file(folder, what));
+        return Err(Error::file(&run.folder, what));
     }
-    let (data, background) = (Arc::new(data), config.background.shown());
-    let mut trainer = Trainer::with_scene_box(config, data.clone(), extent)?;
+    let data = Arc::new(data);
+    let trainer = Trainer::with_scene_box(config, data.clone(), extent)?;
+    Ok((scene, data, trainer))
+}
+
+/// Resumes a run from its last checkpoint.
+fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trained> {
+    let mut run = Run::open(folder)?;
+    let budget = match (args.given(), run.config.budget) {
+        (Some(budget), _) | (None, Some(budget)) => budget,
+        (None, None) => return Err(Error::setting("budget", "the run has none: add --budget or --steps")),
+    };
+    let (scene, data, mut trainer) = reopen(&run)?;
+    let (downscale, background) = (run.config.downscale, run.config.config.background.shown());
     let mut lock = run.lock()?;
     run.sweep();
     checkpoint::load(&run, &mut trainer)?;
@@ -362,10 +421,11 @@ fn train(
     preview: Preview,
     listener: Option<Listener>,
 ) -> Result<Trained> {
+    share(&mut trainer, &run, budget)?;
     let mut window = listener.map(|listener| TrainingViewer::open(listener, &run, &trainer)).transpose()?;
     let mut watch = Watch::new((&run, lock), &trainer, budget, args.checkpoint_every, preview, args.tensorboard)?;
     interrupt::listen();
-    let (mut diverged, mut ended_by_page) = (None, false);
+    let (mut diverged, mut ended_by_page, mut interrupted) = (None, false, false);
     for retreats in 0.. {
         trainer.run(budget, |trainer| {
             let stops = interrupt::requested() || ended_by_page;
@@ -379,18 +439,25 @@ fn train(
             }
             if stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
-        if !trainer.stats().ends_diverged() || watch.has_lost_its_run() {
-            break;
+        interrupted = match ranks::any_is_interrupted(&mut trainer, interrupt::requested()) {
+            Ok(interrupted) => interrupted,
+            Err(error) => {
+                let what = format!("{error}; resume the run with raygrad train --resume {}", run.folder.display());
+                return Err(Error::setting("mpi", what));
+            }
+        };
+        let reason = (trainer.stats().ends_diverged() && !watch.has_lost_its_run()).then(|| watch::reason(&trainer));
+        let tries_again = trainer.stats().has_diverged() && retreats < RETREATS && !interrupted && !ended_by_page;
+        let again = reason.as_ref().is_some_and(|reason| tries_again && watch.retreat(&mut trainer, reason));
+        let state = if again { trainer.state()? } else { vec![] };
+        if let Some(exchange) = trainer.exchange_mut() {
+            ranks::bytes_of_first(exchange, &state)?;
         }
-        let reason = watch::reason(&trainer);
-        let tries_again =
-            trainer.stats().has_diverged() && retreats < RETREATS && !interrupt::requested() && !ended_by_page;
-        if !tries_again || !watch.retreat(&mut trainer, &reason) {
-            diverged = Some(reason);
+        if !again {
+            diverged = reason;
             break;
         }
     }
-    let interrupted = interrupt::requested();
     let ended = match (interrupted || ended_by_page, &diverged) {
         (true, _) => Ended::Interrupted,
         (false, Some(_)) => Ended::Diverged,

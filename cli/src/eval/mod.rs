@@ -19,12 +19,12 @@ use super::lock::{Lock, State, UNFINISHED as UNFINISHED_LOCK};
 use super::machine::processor;
 use super::merge;
 use super::output::{checksum, complain, make_folder, note, numbered, other_numbered, print, remove};
-use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
 use super::run::{Run, write_json};
 use super::scene::{Opened, Scene};
 use super::shard::{self, Complete, Part, Shard, Whole};
+use super::{parse, ranks};
 use alignment::{Alignment, Appearance};
 use judge::Judge;
 use report::{Compared, Conditions, Identity, Machine, Report, Score, Weights, table};
@@ -210,7 +210,7 @@ pub fn run(args: &Args) -> Work<()> {
     let renderer = Renderer::new(model, args.precision)?;
     let judge = Judge { renderer, background: background.shown(), span, data, looks, appearance, lpips };
     let folder = run.file(&name);
-    let Some(shard) = args.shard else {
+    let Some(shard) = args.shard.or_else(ranks::shard) else {
         let report = all(judge, |views| Report::new(conditions, weights, vec![machine], views), &folder)?;
         if !args.json {
             return Ok(describe(&report, &folder)?);

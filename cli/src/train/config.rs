@@ -7,9 +7,11 @@ use raygrad::nerf::losses::DepthConfig;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::{Budget, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
+use raygrad::nn::SLOTS;
 use serde_json::Value;
 
 use super::super::cameras::Viewpoint;
+use super::super::ranks;
 use super::super::run::{RunConfig, usual_checkpoints};
 use super::super::scene::{Opened, Scene};
 use super::Args;
@@ -18,7 +20,7 @@ impl Args {
     /// The configuration of a new run.
     pub fn config(&self, data: &Dataset) -> Result<Config> {
         let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
-        config = config.for_budget(self.budget().samples(), data.pixels_per_side());
+        config = config.for_budget(self.samples(), data.pixels_per_side());
         if let Some(skip) = self.skip {
             config = config.with_skip(skip);
         }
@@ -61,7 +63,7 @@ impl Args {
     /// The most cells along the scene box, or across the NDC frustum, that a hash grid may have with the budget;
     /// infinite for other fields.
     pub fn most_cells(&self, scene_type: SceneType) -> Result<f64> {
-        let config = Config::preset(self.preset).for_budget(self.budget().samples(), f64::INFINITY);
+        let config = Config::preset(self.preset).for_budget(self.samples(), f64::INFINITY);
         let config = config.with_scene_type(scene_type);
         // Contraction leaves half of the cells along an axis to the box.
         let share = if scene_type == SceneType::Unbounded { 0.5 } else { 1.0 };
@@ -108,6 +110,18 @@ impl Args {
     /// The budget of a new run.
     pub fn budget(&self) -> Budget {
         self.given().unwrap_or_else(|| Budget::Time(default_budget(self.preset)))
+    }
+
+    /// Estimate of the samples along rays that fit in the budget, on all ranks.
+    fn samples(&self) -> f64 {
+        let (ranks, threads) = (ranks::own().map_or(1, |(_, ranks)| ranks), rayon::current_num_threads());
+        match self.budget() {
+            // No more than one thread works for each slot.
+            Budget::Time(_) => {
+                self.budget().samples() * (ranks * threads).min(SLOTS) as f64 / threads.min(SLOTS) as f64
+            }
+            Budget::Steps(_) => self.budget().samples(),
+        }
     }
 
     /// The budget, if a flag sets it.

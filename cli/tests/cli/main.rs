@@ -22,6 +22,8 @@ mod convert;
 mod dialects;
 mod export;
 mod lpips;
+#[cfg(feature = "mpi")]
+mod mpi;
 mod outside;
 mod overwrite;
 #[cfg(unix)]

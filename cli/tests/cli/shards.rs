@@ -66,6 +66,22 @@ fn unmerged(place: &Place, command: &str, at: &str) {
     std::fs::write(&file, changed.to_string()).unwrap();
 }
 
+#[cfg(not(feature = "mpi"))]
+#[test]
+fn ranks_without_mpi_are_refused() {
+    let place = Place::with_run();
+    for (command, expected) in [
+        ("train scene --steps 1", "2 processes were started together, but this raygrad is built without MPI"),
+        ("render run --frames 2 --out frames", "built without MPI"),
+        ("doctor scene", "only train, render and eval share their work"),
+    ] {
+        let output = place.command(command).env("OMPI_COMM_WORLD_SIZE", "2").output().unwrap();
+        super::complained(command, &output, &["`mpi`: ", expected]);
+    }
+    let alone = place.command("doctor scene --json").env("OMPI_COMM_WORLD_SIZE", "1").output().unwrap();
+    assert!(alone.stderr.is_empty(), "{alone:?}");
+}
+
 #[test]
 fn render_in_shards_equals_the_whole() {
     let place = Place::with_run();

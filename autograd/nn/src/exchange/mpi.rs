@@ -6,7 +6,8 @@ use mpi::environment::Universe;
 use mpi::request::{StaticScope, scope};
 use mpi::topology::{Process, SimpleCommunicator};
 use mpi::traits::{Communicator, Destination, Equivalence, Source};
-use std::thread::ThreadId;
+use std::cell::RefCell;
+use std::mem::ManuallyDrop;
 use std::time::{Duration, Instant};
 
 /// Tells another rank that this one is there.
@@ -17,27 +18,25 @@ const MESSAGE: i32 = 2;
 const BUSY: Duration = Duration::from_micros(200);
 const PAUSE: Duration = Duration::from_micros(50);
 
+thread_local! {
+    /// MPI, on the thread that has initialised it. Dropping it waits for all ranks, which must not happen where some have
+    /// failed.
+    static UNIVERSE: RefCell<Option<ManuallyDrop<Universe>>> = const { RefCell::new(None) };
+}
+
 /// The ranks of an MPI job, as `mpirun` or `srun` starts them.
 ///
 /// Of each process only the thread that initialises MPI may use it (MPI's level "funneled"). Other threads may compute
-/// meanwhile. MPI ends when this value is dropped, which waits for the other ranks.
+/// meanwhile. At its end a process calls [`finalize`](Self::finalize), or [`abort`](Self::abort) if it has failed.
+///
+/// A rank that hangs while it sends a message ends the job at once, after a line on standard error: MPI cannot give
+/// the buffers of such messages back. A rank that hangs elsewhere is an [error](ExchangeError::TimedOut).
 #[derive(Debug)]
 pub struct Mpi {
-    /// Ends MPI when it is dropped.
-    _universe: Ending,
-    thread: ThreadId,
     rank: usize,
     ranks: usize,
     timeout: Duration,
     sent: u64,
-}
-
-struct Ending(#[allow(dead_code, reason = "it is dropped")] Universe);
-
-impl std::fmt::Debug for Ending {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Universe")
-    }
 }
 
 impl Mpi {
@@ -52,9 +51,15 @@ impl Mpi {
         if threading < Threading::Funneled {
             return Err(failed("this MPI allows no threads; use one built with MPI_THREAD_FUNNELED"));
         }
-        let (world, thread) = (universe.world(), std::thread::current().id());
+        let world = universe.world();
         let [rank, ranks] = [world.rank(), world.size()].map(|x| x as usize);
-        Ok(Mpi { _universe: Ending(universe), thread, rank, ranks, timeout, sent: 0 })
+        UNIVERSE.set(Some(ManuallyDrop::new(universe)));
+        Ok(Mpi { rank, ranks, timeout, sent: 0 })
+    }
+
+    /// Ends MPI if this thread has initialised it. Waits for the other ranks.
+    pub fn finalize() {
+        drop(UNIVERSE.take().map(ManuallyDrop::into_inner));
     }
 
     /// Ends all ranks at once, with this exit code.
@@ -68,14 +73,28 @@ impl Mpi {
         (rank + 1..rank + ranks).map(move |other| other % ranks)
     }
 
+    /// What `look` finds within the timeout.
+    fn within_timeout<R>(&self, mut look: impl FnMut() -> Option<R>) -> Option<R> {
+        let start = Instant::now();
+        loop {
+            let (found, waited) = (look(), start.elapsed());
+            match found {
+                Some(found) => return Some(found),
+                None if waited > self.timeout => return None,
+                None if waited < BUSY => std::thread::yield_now(),
+                None => std::thread::sleep(PAUSE),
+            }
+        }
+    }
+
     /// Waits until every rank is here. Until then nothing is sent but one byte that lives for ever: so this can end
     /// early, where MPI could not give a buffer back.
     fn wait_for_all(&self, world: &SimpleCommunicator) -> Result<(), ExchangeError> {
         static BYTE: [u8; 1] = [0];
         let ready: Vec<_> =
             self.others().map(|to| process(world, to).immediate_send_with_tag(StaticScope, &BYTE[..], READY)).collect();
-        let (start, mut absent): (_, Vec<usize>) = (Instant::now(), self.others().collect());
-        loop {
+        let mut absent: Vec<usize> = self.others().collect();
+        let all_are_here = self.within_timeout(|| {
             absent.retain(|&rank| {
                 let is_here = process(world, rank).immediate_probe_with_tag(READY).is_some();
                 if is_here {
@@ -83,16 +102,11 @@ impl Mpi {
                 }
                 !is_here
             });
-            let waited = start.elapsed();
-            match absent.first() {
-                None => break,
-                Some(&rank) if waited > self.timeout => {
-                    ready.into_iter().for_each(std::mem::forget);
-                    return Err(ExchangeError::TimedOut { rank, after: self.timeout });
-                }
-                Some(_) if waited < BUSY => std::thread::yield_now(),
-                Some(_) => std::thread::sleep(PAUSE),
-            }
+            absent.is_empty().then_some(())
+        });
+        if let (None, Some(&rank)) = (all_are_here, absent.first()) {
+            ready.into_iter().for_each(std::mem::forget);
+            return Err(ExchangeError::TimedOut { rank, after: self.timeout });
         }
         ready.into_iter().for_each(|request| _ = request.wait());
         Ok(())
@@ -114,9 +128,12 @@ impl Exchange for Mpi {
 
     fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
         check_parts(parts, self.ranks);
-        if std::thread::current().id() != self.thread {
-            let what = "MPI is used on another thread than the one that initialised it";
-            return Err(ExchangeError::Connection(what.into()));
+        let error = |what: &str| Err(ExchangeError::Connection(what.into()));
+        if UNIVERSE.with_borrow(Option::is_none) {
+            return error("MPI has ended, or is used on another thread than the one that initialised it");
+        }
+        if parts.iter().any(|part| i32::try_from(part.len()).is_err()) {
+            return error("MPI cannot send a message of 2 GB or more; use more tiles or a smaller model");
         }
         let world = SimpleCommunicator::world();
         self.wait_for_all(&world)?;
@@ -127,8 +144,12 @@ impl Exchange for Mpi {
             let sends: Vec<_> = self.others().map(send).collect();
             for from in self.others() {
                 let from_rank = process(&world, from);
-                let length = from_rank.probe_with_tag(MESSAGE).count(u8::equivalent_datatype());
-                let mut message = vec![0_u8; length as usize];
+                let Some(status) = self.within_timeout(|| from_rank.immediate_probe_with_tag(MESSAGE)) else {
+                    let error = ExchangeError::TimedOut { rank: from, after: self.timeout };
+                    eprintln!("raygrad: rank {}: {error}; the job is aborted", self.rank);
+                    Mpi::abort(1);
+                };
+                let mut message = vec![0_u8; status.count(u8::equivalent_datatype()) as usize];
                 from_rank.receive_into_with_tag(&mut message[..], MESSAGE);
                 received[from] = message;
             }

@@ -1,0 +1,118 @@
+//! Ranks of an MPI job, with the feature `mpi`. They need `mpirun` of Open MPI.
+
+use super::{Place, SMALL, files_below, wait};
+use std::process::{Child, Command, Output, Stdio};
+
+/// A command on several ranks.
+fn on_ranks(place: &Place, ranks: usize, arguments: &str) -> Command {
+    let mut command = Command::new("mpirun");
+    command.args(["--allow-run-as-root", "--oversubscribe", "--bind-to", "none", "-n", &ranks.to_string()]);
+    command.arg(env!("CARGO_BIN_EXE_raygrad")).args(arguments.split_whitespace()).current_dir(place.path(""));
+    command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+/// What a command printed, on all ranks together.
+#[track_caller]
+fn succeeds(place: &Place, ranks: usize, arguments: &str) -> String {
+    let output = on_ranks(place, ranks, arguments).output().expect("mpirun of Open MPI is needed");
+    assert!(output.status.success(), "{ranks} ranks, {arguments}: {output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// The process of a rank.
+fn process(job: &Child, rank: usize) -> Option<String> {
+    let children = Command::new("pgrep").args(["-P", &job.id().to_string()]).output().unwrap();
+    let children = String::from_utf8(children.stdout).unwrap();
+    let is_it = |process: &&str| {
+        let environment = std::fs::read(format!("/proc/{process}/environ")).unwrap_or_default();
+        let wanted = format!("OMPI_COMM_WORLD_RANK={rank}");
+        environment.split(|byte| *byte == 0).any(|variable| variable == wanted.as_bytes())
+    };
+    children.lines().find(is_it).map(str::to_owned)
+}
+
+/// Starts a long training on ranks, and sends a signal to one of them when it has saved a checkpoint.
+fn disturbed(place: &Place, arguments: &str, rank: usize, signal: &str) -> Output {
+    let mut job = on_ranks(place, 2, &format!("train scene {SMALL} --out run {arguments}")).spawn().unwrap();
+    let metrics = place.path("run/metrics.jsonl");
+    wait(&mut job, || std::fs::metadata(&metrics).is_ok_and(|file| file.len() > 0));
+    let process = process(&job, rank).unwrap();
+    assert!(Command::new("kill").args([format!("-{signal}"), process]).status().unwrap().success());
+    job.wait_with_output().unwrap()
+}
+
+#[test]
+fn ranks_train_the_model_of_one_process() {
+    let place = Place::with_scene();
+    let train = |steps: usize, out: &str| format!("train scene --steps {steps} {SMALL} --out {out}");
+    place.succeeds(&train(12, "one"));
+    for ranks in [1, 2, 3, 4] {
+        let out = format!("ranks-{ranks}");
+        let printed = succeeds(&place, ranks, &train(12, &out));
+        assert_eq!(printed.matches("trained  12 steps").count(), 1, "{printed}");
+        assert_eq!(printed.contains(&format!("ranks    {ranks}, connected by MPI")), ranks > 1, "{printed}");
+        assert!(place.bytes(&format!("{out}/model.safetensors")) == place.bytes("one/model.safetensors"), "{ranks}");
+    }
+    // More steps on another number of ranks.
+    succeeds(&place, 3, "train --resume ranks-2 --steps 20");
+    place.succeeds("train --resume one --steps 20");
+    assert!(place.bytes("ranks-2/model.safetensors") == place.bytes("one/model.safetensors"));
+}
+
+#[test]
+fn ranks_share_frames_and_views() {
+    let place = Place::with_run();
+    let render = "render run --frames 5 --size 8x6 --save depth --out";
+    place.succeeds(&format!("{render} one"));
+    let printed = succeeds(&place, 3, &format!("{render} ranks"));
+    assert_eq!(printed.matches("rendered 5 frames").count(), 1, "{printed}");
+    assert_eq!(files_below(&place.path("ranks")), files_below(&place.path("one")));
+    let measured = |printed: String| {
+        let lines = printed.lines().filter(|line| line.starts_with("test/") || line.starts_with("mean"));
+        lines.map(str::to_owned).collect::<Vec<_>>()
+    };
+    let one = measured(place.succeeds("eval run"));
+    assert_eq!(measured(succeeds(&place, 2, "eval run")), one);
+    assert_eq!(one.len(), 3 + 1);
+    // A single image is rendered by one rank.
+    succeeds(&place, 2, "render run --size 8x6 --out image.png");
+}
+
+#[test]
+fn interrupted_rank_saves_the_run_of_all() {
+    let place = Place::with_scene();
+    let output = disturbed(&place, "--budget 1h --checkpoint-every 1s", 1, "TERM");
+    assert_eq!(output.status.code(), Some(130), "{output:?}");
+    assert_eq!(place.json("run/summary.json")["ended"], "interrupted");
+    let stopped = place.json("run/summary.json")["steps"].as_u64().unwrap();
+    let printed = succeeds(&place, 2, &format!("train --resume run --steps {}", stopped + 3));
+    assert!(printed.contains(&format!("resumed  at step {stopped}")), "{printed}");
+}
+
+#[test]
+fn dead_and_hung_ranks_end_the_job_with_the_last_checkpoint() {
+    for (signal, arguments, expected) in [
+        ("KILL", "--budget 1h --checkpoint-every 1s", "signal 9"),
+        ("STOP", "--budget 1h --checkpoint-every 1s --rank-timeout 3s", "rank 1 has sent nothing for 3 s"),
+    ] {
+        let place = Place::with_scene();
+        let output = disturbed(&place, arguments, 1, signal);
+        assert!(!output.status.success() && said(&output).contains(expected), "{signal}: {}", said(&output));
+        let printed = place.succeeds("train --resume run --budget 1s");
+        assert!(printed.contains("resumed  at step "), "{printed}");
+    }
+}
+
+#[test]
+fn errors_of_a_rank_end_all() {
+    let place = Place::with_scene();
+    let output = on_ranks(&place, 2, "train missing --steps 3").output().unwrap();
+    assert!(!output.status.success() && said(&output).contains("raygrad: rank 0: missing:"), "{}", said(&output));
+    let output = on_ranks(&place, 2, "doctor scene").output().unwrap();
+    assert!(said(&output).contains("only train, render and eval share their work"), "{}", said(&output));
+}
