@@ -45,7 +45,8 @@ impl Formula<1> for SoftSign {
 }
 
 fn main() {
-    // It runs as any other operation does, and has derivatives of every order.
+    // It runs as any other operation does, and has derivatives of every order. An `Op` with a gradient on plain tensors
+    // has them only with a `reference`; without one, `grad_graph` is an error and never 0.
     let tape = Tape::<f32>::new();
     let x = tape.leaf(Tensor::from([-1.0, 0.5, 3.0]));
     let y = SoftSign { mistake: Mistake::None }.on([&x]);

@@ -139,7 +139,8 @@
 //!
 //! An operation that is not elementwise is an [`Op`](crate::Op), whose derivative is written with variables. An
 //! operation may be *fused*: then it has a `reference` made of plain operations, for its tests and its second
-//! derivative. A function made of operations needs no derivative.
+//! derivative. A derivative on plain tensors without a reference has no second derivative: asking for one is
+//! [`Error::Unrecorded`](crate::Error::Unrecorded), and never 0. A function made of operations needs no derivative.
 //! [`check_function`](crate::autograd::check::check_function) checks it.
 //!
 //! # A model that learns

@@ -60,6 +60,20 @@ pub enum Error {
         /// The line that requested the gradient.
         at: &'static Location<'static>,
     },
+    /// In a recorded backward pass, the [`vjp`](crate::Op::vjp) of an operation computed a gradient outside of the
+    /// tape. Its derivative would be 0 without reason.
+    #[error(
+        "{op}: {what}, so the gradient has no derivative; write `vjp` with operations on `Var`s, give the operation a \
+         `reference` and set `is_fused`, or return `None` for a gradient of 0 (recorded at {at})"
+    )]
+    Unrecorded {
+        /// The operation.
+        op: &'static str,
+        /// The gradient or the value that `vjp` took from the tape.
+        what: String,
+        /// The line of the user's code that recorded the operation.
+        at: &'static Location<'static>,
+    },
     /// The graph was freed by an earlier [`Var::backward`](crate::Var::backward) or [`Tape::free`](crate::Tape::free).
     #[error(
         "the graph was freed by an earlier `backward` or `Tape::free`; use `grad` for all gradients but the last (at {at})"

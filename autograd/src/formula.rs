@@ -225,9 +225,11 @@ fn given<'s, 't, T: Scalar, const N: usize>(
 fn recorded<'t, T: Scalar>(cx: &Vjp<'t, '_, T>, sheet: &Sheet<'t, T>, grads: &[Recorded<'_, 't, T>]) -> Grads<'t, T> {
     let needed: SmallVec<[_; 4]> = (0..grads.len()).filter(|&i| cx.needs(i)).map(|i| grads[i]).collect();
     let mut vars = sheet.vars(cx.g(), &needed).into_iter();
-    // A gradient may be a constant, which has no axes.
+    // A gradient that is 0 everywhere is a constant. A constant has no axes.
+    let is_zero = |grad: &Var<'t, T>| !grad.is_on_graph() && grad.value().iter().all(|x| x == T::ZERO);
     let stretched = |grad: Var<'t, T>, i| grad.broadcast_to(cx.g().shape()).sum_to(cx.shape(i));
-    Grads::new((0..grads.len()).map(|i| if cx.needs(i) { vars.next().map(|grad| stretched(grad, i)) } else { None }))
+    let mut next = |i| vars.next().filter(|grad| !is_zero(grad)).map(|grad| stretched(grad, i));
+    Grads::new((0..grads.len()).map(|i| if cx.needs(i) { next(i) } else { None }))
 }
 
 /// The required gradients, summed to the shapes of their operands. Separate from the loop, so that it is compiled once

@@ -38,9 +38,10 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The same value, with a hook that replaces its gradient: in every backward pass, the summed gradient goes through
     /// `f`.
     ///
-    /// `f` works on variables, so a recorded pass records it and differentiates it too. `f` is not called if no
-    /// gradient arrives. The hook sees the gradients of the returned variable alone; use that variable in place of
-    /// `self`.
+    /// `f` works on variables, so a recorded pass records it and differentiates it too. Such a pass fails with
+    /// [`Error::Unrecorded`](crate::Error::Unrecorded) if the result does not depend on the gradient. `f` is not called
+    /// if no gradient arrives. The hook sees the gradients of the returned variable alone; use that variable in place
+    /// of `self`.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

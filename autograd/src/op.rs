@@ -5,6 +5,7 @@ use crate::reading::Reading;
 use crate::{Error, ShapeError, SparseGrad, Tape, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
+use std::cell::Cell;
 use std::sync::Arc;
 
 /// An operation with one output. Implement it for a custom operation, and run it with [`Tape::apply`].
@@ -67,6 +68,14 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
     ///
     /// Each gradient has the shape of its input. An input for which `cx.needs(i)` is false may get `None`. A wrong
     /// number of gradients or a wrong shape makes the backward pass panic.
+    ///
+    /// In a recorded pass ([`Var::grad_graph`], [`Var::hessian`]), the gradients are differentiated too. So compute
+    /// them with operations on the variables [`Vjp::g`], [`Vjp::x`] and [`Vjp::y`]. Code on plain tensors needs a
+    /// [`reference`](Self::reference) and [`is_fused`](Self::is_fused), which give the derivatives instead.
+    ///
+    /// A recorded pass fails with [`Error::Unrecorded`] if a gradient does not depend on [`Vjp::g`], or if this method
+    /// calls [`Vjp::input`] or [`Vjp::output`]. Return `None` for a gradient that is 0. The pass cannot see that a
+    /// factor comes from [`Var::value`] or [`Var::detach`]; the second derivatives of `check::check_op` do.
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T>;
 
     /// As [`vjp`](Self::vjp), for an operation that takes gradients itself and returns their errors. The backward pass
@@ -184,6 +193,9 @@ pub struct Vjp<'t, 'a, T: Scalar> {
     pub(crate) output: &'a Kept<T>,
     pub(crate) node: u32,
     pub(crate) needs: &'a [bool],
+    /// The last operand on the graph whose value a recorded pass read as a tensor: an input, or the output after all of
+    /// them.
+    pub(crate) plain: Cell<Option<usize>>,
 }
 
 impl<'t, T: Scalar> Vjp<'t, '_, T> {
@@ -211,21 +223,26 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
         self.kept(self.output, Some(self.node), "the output")
     }
 
-    /// The value of input `i`, for a pass that is not recorded.
+    /// The value of input `i`, for a pass that is not recorded. A recorded one fails with [`Error::Unrecorded`] if the
+    /// input is on the graph. Where a value only selects between cases, as a mask does, use `x(i).value()`.
     ///
     /// # Panics
     /// As [`x`](Self::x).
     #[track_caller]
     pub fn input(&self, i: usize) -> &Tensor<T> {
+        if self.edges[i] != CONSTANT {
+            self.plain.set(Some(i));
+        }
         self.value_of(&self.inputs[i], "an input")
     }
 
-    /// The value of the output, for a pass that is not recorded.
+    /// The value of the output, for a pass that is not recorded; see [`input`](Self::input).
     ///
     /// # Panics
     /// As [`y`](Self::y).
     #[track_caller]
     pub fn output(&self) -> &Tensor<T> {
+        self.plain.set(Some(self.len()));
         self.value_of(self.output, "the output")
     }
 
@@ -317,7 +334,7 @@ impl<'t, T: Scalar> Grads<'t, T> {
         Grads(smallvec::smallvec![Some(Given::Dense(grad))])
     }
 
-    /// The gradients of several inputs; `None` where a gradient is zero or not needed.
+    /// The gradients of several inputs; `None` where a gradient is 0 or not needed.
     pub fn new(grads: impl IntoIterator<Item = Option<Var<'t, T>>>) -> Self {
         Grads(grads.into_iter().map(|grad| grad.map(Given::Dense)).collect())
     }

@@ -133,7 +133,7 @@ impl<T: Scalar> Op<T> for LogSumExp {
         if cx.recording() {
             let mut column = Shape::from_slice(g.shape());
             column.push(1);
-            let is_lost = cx.output().map(|y| if y == T::from_f64(f64::NEG_INFINITY) { T::ONE } else { T::ZERO });
+            let is_lost = cx.y().value().map(|y| if y == T::from_f64(f64::NEG_INFINITY) { T::ONE } else { T::ZERO });
             let is_lost = is_lost.reshape(&column).broadcast_to(x.shape()).gt(T::ZERO);
             // The logarithms of a row of -inf are NaN, and so would their gradients be that are not chosen.
             let kept = x.constant(0.0).where_(&is_lost, &x);
