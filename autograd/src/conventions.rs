@@ -11,7 +11,8 @@
 //!   order, gets all of it.
 //! * A step has gradient 0.
 //! * A kink has the gradient of the side that its formula takes.
-//! * Where infinity times 0 would be NaN but a limit exists, the value is that limit.
+//! * Where infinity times 0 would be NaN but a limit exists, the value is that limit. Second derivatives follow this
+//!   rule too.
 //!
 //! ## Kinks and steps
 //!
@@ -119,6 +120,8 @@
 //! | `silu(x)` | `-inf` | `0` | `0` | |
 //! | `silu(x)` | `inf` | `inf` | `1` | |
 //! | `tanh(x)` | `inf` | `1` | `0` | |
+//! | `erf(x)` | `-inf` | `-1` | `0` | |
+//! | `huber(a, b, 2)` | `inf; 0` | `inf` | `2; -2` | |
 //! | `binary_cross_entropy_with_logits(a, b)` | `1000; 0` | `1000` | `1; -1000` | |
 
 #[cfg(test)]
@@ -141,6 +144,7 @@ mod tests {
             "absolute_error(a, b)" => a.absolute_error(b),
             "huber(a, b, 2)" => a.huber(b, 2.0),
             "smooth_l1(a, b, 0)" => a.smooth_l1(b, 0.0),
+            "smooth_l1(a, b, 0.5)" => a.smooth_l1(b, 0.5),
             "maximum(a, b)" => a.maximum(b),
             "minimum(a, b)" => a.minimum(b),
             "max(x)" => a.max(),
@@ -165,6 +169,8 @@ mod tests {
             "powi(x, 0)" => a.powi(0),
             "powi(x, -1)" => a.powi(-1),
             "powf(x, 0.5)" => a.powf(0.5),
+            "powf(x, 1)" => a.powf(1.0),
+            "powf(x, 2)" => a.powf(2.0),
             "pow(a, b)" => a.pow(b),
             "xlogy(a, b)" => a.xlogy(b),
             "norm(x)" => a.norm(),
@@ -185,6 +191,8 @@ mod tests {
             "gelu_tanh(x)" => a.gelu_tanh(),
             "silu(x)" => a.silu(),
             "tanh(x)" => a.tanh(),
+            "erf(x)" => a.erf(),
+            "normal_cdf(x)" => a.normal_cdf(),
             "binary_cross_entropy_with_logits(a, b)" => a.binary_cross_entropy_with_logits(b),
             _ => return None,
         })
@@ -207,10 +215,15 @@ mod tests {
     fn second<T: Scalar>(operation: &str, x: &[Tensor<T>]) -> Vec<Tensor<T>> {
         let tape = Tape::<T>::new();
         let vars: Vec<Var<'_, T>> = x.iter().map(|x| tape.leaf(x.clone())).collect();
+        let factor = tape.leaf(Tensor::scalar(T::ONE));
         let x: Vec<&Var<'_, T>> = vars.iter().collect();
-        let first = apply(operation, &vars).unwrap().sum().grad_graph(&x);
-        let total = first.iter().zip(1..).map(|(x, k)| x.sum() * f64::from(k)).reduce(|a, b| a + b).unwrap();
-        total.tracked().grad(&x)
+        let first = (apply(operation, &vars).unwrap().sum() * &factor).grad_graph(&x);
+        let total = first.iter().zip(1..).map(|(x, k)| x.sum() * f64::from(k)).reduce(|a, b| a + b).unwrap().tracked();
+        let wrt: Vec<_> = x.iter().copied().chain([&factor]).collect();
+        let mut grads = total.grad(&wrt);
+        let by_factor = grads.pop().unwrap().item();
+        assert_eq!(by_factor, total.item(), "{operation}: the gradient is linear in that of the output");
+        grads
     }
 
     #[test]
@@ -235,6 +248,25 @@ mod tests {
             ("gelu(x)", "-inf", "0"),
             ("silu(x)", "-inf", "0"),
             ("tanh(x)", "inf", "0"),
+            ("asin(x)", "1", "inf"),
+            ("asin(x)", "-1", "-inf"),
+            ("acos(x)", "1", "-inf"),
+            ("acos(x)", "-1", "inf"),
+            ("atan2(a, b)", "inf; 1", "0; 0"),
+            ("atan2(a, b)", "-1; -inf", "0; 0"),
+            ("atan2(a, b)", "inf; inf", "0; 0"),
+            ("powf(x, 0.5)", "inf", "0"),
+            ("powf(x, 1)", "inf", "0"),
+            ("powf(x, 2)", "1e30", "2"),
+            ("erf(x)", "inf", "0"),
+            ("erf(x)", "-inf", "0"),
+            ("normal_cdf(x)", "inf", "0"),
+            ("normal_cdf(x)", "-inf", "0"),
+            ("huber(a, b, 2)", "inf; 0", "0; 0"),
+            ("huber(a, b, 2)", "0; inf", "0; 0"),
+            ("smooth_l1(a, b, 0.5)", "inf; 0", "0; 0"),
+            ("smooth_l1(a, b, 0.5)", "-inf; 0", "0; 0"),
+            ("smooth_l1(a, b, 0)", "inf; 0", "0; 0"),
         ] {
             let got = second::<f64>(operation, &tensors(at));
             assert!(same(&got, &tensors(expected)), "{operation} at {at}: {got:?}");

@@ -221,8 +221,8 @@ impl<E: Real, const N: usize> Real for Dual<E, N> {
         sigmoid: |s, x| sigmoid_slope(s, x);
         softplus: |s, x| softplus_slope(s, x);
         exp2: |s, x| exp2_slope(s, x, x.exp2());
-        erf: |s, x| bell(s, x, -1.0) * x.like(FRAC_2_SQRT_PI);
-        normal_cdf: |s, x| bell(s, x, -0.5) * x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2);
+        erf: |s, x| bell(s, within(x, FAR), -1.0) * x.like(FRAC_2_SQRT_PI);
+        normal_cdf: |s, x| bell(s, within(x, FAR), -0.5) * x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2);
         tan: |s, x| s * (x.like(1.0) + x.tan() * x.tan());
         sinh: |s, x| sinh_slope(s, x);
         cosh: |s, x| cosh_slope(s, x);

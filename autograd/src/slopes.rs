@@ -36,6 +36,16 @@ pub(crate) fn at_most<E: Real>(x: E, high: f64) -> E {
     (x - high).if_positive(high, x)
 }
 
+/// `x` limited to `-limit..=limit`; NaN stays NaN.
+#[inline(always)]
+pub(crate) fn within<E: Real>(x: E, limit: f64) -> E {
+    at_most(at_least(x, -limit), limit)
+}
+
+/// Where a bell and an activation have long reached their limits, but the square is still in range. Beyond it, further
+/// derivatives would be infinity times 0.
+pub(crate) const FAR: f64 = 1e4;
+
 /// `s e^x`, for y = e^x.
 #[inline(always)]
 pub(crate) fn exp_slope<E: Real>(s: E, x: E, y: E) -> E {
@@ -179,7 +189,10 @@ pub(crate) fn sqrt_slope<E: Real>(s: E, y: E) -> E {
 #[inline(always)]
 pub(crate) fn complement<E: Real>(x: E) -> E {
     let one = x.like(1.0);
-    ((one - x) * (one + x)).sqrt()
+    let square = (one - x) * (one + x);
+    // At +-1 another zero: the root has an infinite slope there, and its argument the slope 0 in one factor.
+    let is_inside = square.abs();
+    is_inside.if_positive(is_inside.if_positive(square, one).sqrt(), one - x.abs())
 }
 
 /// `s / (1 + x^2)`, without the 1 and the square where the square could overflow.
@@ -194,8 +207,12 @@ pub(crate) fn atan_slope<E: Real>(s: E, x: E) -> E {
 /// `s c / (a^2 + b^2)` for c = a or b; 0 at the origin and at infinity.
 #[inline(always)]
 pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
-    let largest = a.abs().maximum(b.abs());
-    let scale = unless_zero(largest);
+    let (one, largest) = (a.like(1.0), a.abs().maximum(b.abs()));
+    let length = unless_zero(largest);
+    // The limit is 0 for an infinite vector. The other branch stays finite, or the next derivative would be NaN.
+    let is_finite = one / length;
+    let (a, b) = (is_finite.if_positive(a, one), is_finite.if_positive(b, one));
+    let (c, scale) = (is_finite.if_positive(c, one), is_finite.if_positive(length, one));
     let square = unit_square(a / scale, b / scale);
     let full = checked!(
         s / scale / square * (c / scale),
@@ -204,8 +221,7 @@ pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
         [],
         (s.wide() / scale.wide() / square.wide() * (c.wide() / scale.wide())).narrow()
     );
-    // The limit is 0 for an infinite vector.
-    (a.like(1.0) / scale).if_positive(full, s / scale)
+    is_finite.if_positive(full, s / length)
 }
 
 /// The derivative `a / y` of the length y of the vector (a, b) by a; 0 at the origin. A length that is a subnormal number
@@ -319,10 +335,12 @@ pub(crate) fn base_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     // Of two zeros it is infinite and not chosen; the next derivative would be NaN.
     let less = (a.abs() + b.abs()).if_positive(a, one).pow(b - one);
     let is_exact = (b - one) * (b.like(1e6) - b);
-    let power = is_exact.if_positive(less, y / base);
-    // A zero base has its limit, and a subnormal y has lost digits.
+    // The branch for ordinary bases stays finite at others, or the next derivative would be NaN.
     let of_ordinary = |x: E| is_ordinary.if_positive(x, one);
-    let factors = [of_ordinary(power), of_ordinary(b * power), is_exact.if_positive(one, of_ordinary(y))];
+    let inexact = is_exact.if_positive(one, of_ordinary(y));
+    let power = of_ordinary(is_exact.if_positive(less, inexact / base));
+    // A zero base has its limit, and a subnormal y has lost digits.
+    let factors = [power, of_ordinary(b * power), inexact];
     // Several factors may bring a number back into range that was lost, whatever s is.
     let full = checked!(s * (b * power), one + one, [], factors, {
         let y = is_ordinary.if_positive(y, one);

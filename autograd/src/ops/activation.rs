@@ -1,7 +1,7 @@
 //! Activation functions.
 
 use crate::cases::INF;
-use crate::slopes::{at_least, at_most, bell, checked, near_sigmoid, wide_bell, wide_sigmoid};
+use crate::slopes::{FAR, at_least, at_most, bell, checked, near_sigmoid, wide_bell, wide_sigmoid, within};
 use crate::{Cases, Formula, Var};
 use raygrad_tensor::{Real, Scalar, Wide};
 use std::f64::consts::{FRAC_1_SQRT_2, FRAC_2_SQRT_PI};
@@ -151,7 +151,7 @@ impl Formula<1> for Gelu {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
-        let x = at_most(at_least(x, -FAR), FAR);
+        let x = within(x, FAR);
         let peak = x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2);
         let (share, density) = (x.normal_cdf(), peak * bell(x, x, -0.5));
         [checked!(g * (share + density), g, [], [share], {
@@ -184,7 +184,7 @@ impl Formula<1> for GeluTanh {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
-        let x = at_most(at_least(x, -FAR), FAR);
+        let x = within(x, FAR);
         let [u, low] = gelu_argument(x);
         let share = near_sigmoid(u, low);
         let slope = x * (x.like(GELU_SCALE) + x.like(3.0 * GELU_SCALE * GELU_CUBIC) * (x * x));
@@ -215,7 +215,7 @@ impl Formula<1> for Silu {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
-        let x = at_most(at_least(x, -FAR), FAR);
+        let x = within(x, FAR);
         let share = x.sigmoid();
         let density = share * (-x).sigmoid();
         [checked!(g * (share + x * density), g * x, [], [share], {
@@ -228,9 +228,6 @@ impl Formula<1> for Silu {
         c.at([-20.0], -4.122_307_236e-8, [-3.916_191_867e-8]).at([f64::NAN], f64::NAN, [f64::NAN]);
     }
 }
-
-/// Where an activation has long reached its limits, but the square is still in range.
-const FAR: f64 = 1e4;
 
 const GELU_CUBIC: f64 = 0.044_715;
 const GELU_SCALE: f64 = 1.595_769_121_605_730_7; // 2 sqrt(2/pi)

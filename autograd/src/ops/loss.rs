@@ -2,7 +2,7 @@
 
 use crate::cases::INF;
 use crate::error::ensure;
-use crate::slopes::{checked, product_over, scaled_difference, softplus_slope};
+use crate::slopes::{checked, product_over, scaled_difference, softplus_slope, within};
 use crate::{Cases, Formula, Grads, Op, Operand, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
 use raygrad_tensor::{Indices, Pool, Real, Scalar, Shape, Tensor};
@@ -60,9 +60,8 @@ impl Formula<2> for Huber {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
-        let (r, delta) = (a - b, a.like(self.delta));
-        let far = r.if_positive(g * delta, -(g * delta));
-        let da = (r.abs() - delta).if_positive(far, g * r);
+        // Limited and not chosen: an infinite residual times 0 would be NaN in the next derivative.
+        let da = g * within(a - b, self.delta);
         [da, -da]
     }
     fn cases(&self, c: &mut Cases) {
@@ -98,9 +97,11 @@ impl Formula<2> for SmoothL1 {
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
         let (r, beta) = (a - b, a.like(self.beta));
-        let near = product_over(g, r, SmoothL1::width(beta));
+        // Finite where it is not chosen, or the next derivative would be NaN.
+        let limited = within(r, self.beta);
+        let near = product_over(g, limited, SmoothL1::width(beta));
         // Constant also at 0, which is far if beta is 0; NaN stays.
-        let far = r.if_positive(g, (-r).if_positive(-g, g * r * a.like(0.0)));
+        let far = r.if_positive(g, (-r).if_positive(-g, g * limited * a.like(0.0)));
         let da = (beta - r.abs()).if_positive(near, far);
         [da, -da]
     }
