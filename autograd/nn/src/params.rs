@@ -152,6 +152,48 @@ impl<T: Scalar> Params<T> {
         self.ids().zip(&self.settings).filter(|(_, setting)| !setting.frozen).map(|(id, _)| id)
     }
 
+    /// The gradient of a parameter, or None if it is frozen. `grads` has one entry for each parameter that is not
+    /// frozen, in the order of [`trainable`](Self::trainable): [`Bound::backward`], [`TileSums::grads`], or the tensors
+    /// and variables that [`Var::grad`] and [`Var::grad_graph`] return for [`Bound::vars`].
+    ///
+    /// ```
+    /// use raygrad_autograd::{Activation, Tape, Tensor};
+    /// use raygrad_nn::{Init, Linear, Params};
+    /// use rand::SeedableRng;
+    /// let mut rng = rand::rngs::StdRng::seed_from_u64(1);
+    /// let mut params = Params::<f32>::new();
+    /// let layer = Linear::new(&mut params, "layer", [2, 3], Activation::Identity, Init::Glorot, &mut rng);
+    /// params.freeze(|name| name == "layer.weight");
+    /// let tape = Tape::new();
+    /// let bound = params.bind(&tape);
+    /// let loss = layer.forward(&bound, &tape.constant(Tensor::ones(&[5, 2]))).sum();
+    /// let grads = bound.backward(&loss);
+    /// let bias = params.grad(&grads, layer.bias().unwrap()).unwrap();
+    /// assert_eq!(bias.dense().unwrap(), &Tensor::full(&[3], 5.0));
+    /// assert!(params.grad(&grads, layer.weight()).is_none());
+    /// ```
+    ///
+    /// # Panics
+    /// If the handle belongs to another store, or there is not one gradient for each parameter that is not frozen.
+    ///
+    /// [`TileSums::grads`]: crate::TileSums::grads
+    /// [`Var::grad`]: raygrad_autograd::Var::grad
+    /// [`Var::grad_graph`]: raygrad_autograd::Var::grad_graph
+    #[track_caller]
+    pub fn grad<'a, G>(&self, grads: &'a [G], id: ParamId) -> Option<&'a G> {
+        let place = self.names.place(id);
+        self.check_count(grads.len());
+        let before = self.settings[..place].iter().filter(|setting| !setting.frozen).count();
+        if self.settings[place].frozen { None } else { grads.get(before) }
+    }
+
+    /// Panics if there is not one gradient for each parameter that is not frozen.
+    #[track_caller]
+    fn check_count(&self, grads: usize) {
+        let free = self.settings.iter().filter(|setting| !setting.frozen).count();
+        assert_eq!(grads, free, "one gradient for each parameter that is not frozen");
+    }
+
     /// The handles in order.
     pub fn ids(&self) -> impl ExactSizeIterator<Item = ParamId> + '_ {
         self.names.keys.iter().enumerate().map(|(place, &key)| ParamId { place, key })
@@ -284,8 +326,7 @@ impl<T: Scalar> Params<T> {
         grads: &'a [Gradient<T>],
         rate: impl Fn(usize) -> f64,
     ) -> impl Iterator<Item = ParamUpdate<'a, T>> {
-        let free = self.settings.iter().filter(|setting| !setting.frozen).count();
-        assert_eq!(grads.len(), free, "one gradient for each parameter that is not frozen");
+        self.check_count(grads.len());
         // Before anything is moved.
         for (id, grad) in self.trainable().zip(grads) {
             let rate = rate(id.place);

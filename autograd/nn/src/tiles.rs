@@ -63,7 +63,8 @@ pub struct Tiles<T: Scalar, S = ()> {
 
 /// The result of a step.
 pub struct TileSums<T: Scalar, R> {
-    /// The gradient of each parameter that is not frozen, in order, for an [`Optimizer`](crate::Optimizer).
+    /// The gradient of each parameter that is not frozen, in the order of the store, for an
+    /// [`Optimizer`](crate::Optimizer). [`Params::grad`] finds that of a handle.
     pub grads: Vec<Gradient<T>>,
     /// The second result of each tile's `loss`, in the order of the tiles.
     pub results: Vec<R>,

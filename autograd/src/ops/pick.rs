@@ -293,12 +293,13 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.plus(Pick { method: ELEMENTS, axis, places: Places::Elements(index.into()) }, source)
     }
 
-    /// Selects entries along `axis` by index: `[.., n, ..]` to `[.., index.len(), ..]`. The gradient is
+    /// Selects entries along `axis` by index (`numpy.take`): `[.., n, ..]` to `[.., index.len(), ..]`. The gradient is
     /// [added](Self::index_add) to the selected entries. Along the first axis it is sparse, as that of
     /// [`gather_rows`](Self::gather_rows).
     ///
     /// # Panics
     /// If the axis does not exist, or an index is not below its extent.
+    #[doc(alias = "take")]
     #[track_caller]
     pub fn index_select(&self, axis: isize, index: impl Into<Indices>) -> Self {
         let (axis, index) = (self.axis("index_select", axis), self.line("index_select", index));

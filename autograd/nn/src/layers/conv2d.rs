@@ -50,6 +50,16 @@ impl Conv2d {
         Conv2d { weight: params.add(format!("{name}.weight"), weight), bias: None, config, activation }
     }
 
+    /// The handle of the weight.
+    pub fn weight(&self) -> ParamId {
+        self.weight
+    }
+
+    /// The handle of the bias, if there is one.
+    pub fn bias(&self) -> Option<ParamId> {
+        self.bias
+    }
+
     /// Computes the layer's output.
     ///
     /// ```

@@ -4,8 +4,7 @@ use super::Init;
 use crate::{Bound, ParamId, Params};
 use rand::Rng;
 use raygrad_autograd::Var;
-use raygrad_tensor::Scalar;
-use std::sync::Arc;
+use raygrad_tensor::{Indices, Scalar};
 
 /// An embedding: a table with one learned vector for each of many items, such as words, images or places.
 ///
@@ -25,7 +24,7 @@ use std::sync::Arc;
 ///
 /// let tape = Tape::new();
 /// let bound = params.bind(&tape);
-/// let vectors = words.forward(&bound, &[17, 4, 17].into());
+/// let vectors = words.forward(&bound, [17, 4, 17]);
 /// assert_eq!(vectors.shape(), [3, 8]);
 /// let grads = bound.backward(&vectors.square().sum());
 /// let report = adam.update(&mut params, &grads, 1e-3);
@@ -53,12 +52,13 @@ impl Embedding {
         self.table
     }
 
-    /// Looks up the vectors of these rows: `[index.len(), width]`.
+    /// Looks up the vectors of these rows: `[index.len(), width]`. The indices are an array, a vector, a slice, a
+    /// shared slice (`Arc<[u32]>`, without a copy) or [`Indices`] of one axis.
     ///
     /// # Panics
-    /// If an index is not below the number of rows.
+    /// If an index is not below the number of rows, or the indices have not exactly one axis.
     #[track_caller]
-    pub fn forward<'t, T: Scalar>(&self, params: &Bound<'t, T>, index: &Arc<[u32]>) -> Var<'t, T> {
+    pub fn forward<'t, T: Scalar>(&self, params: &Bound<'t, T>, index: impl Into<Indices>) -> Var<'t, T> {
         params[self.table].gather_rows(index)
     }
 }
@@ -69,6 +69,7 @@ mod tests {
     use rand::SeedableRng;
     use raygrad_autograd::check::{Check, check_function};
     use raygrad_autograd::{Tape, Tensor};
+    use std::sync::Arc;
 
     #[test]
     fn a_table_is_learned_through_dense_gradients_too() {
@@ -78,14 +79,27 @@ mod tests {
         assert_eq!(params.iter().map(|(name, _)| name).collect::<Vec<_>>(), ["words.weight"]);
         let table = params.values()[0].clone();
         check_function(&Check::default(), std::slice::from_ref(&table), |x| {
-            layer.forward(&params.layout().bind(x.to_vec()), &[4, 1, 4].into()).exp()
+            layer.forward(&params.layout().bind(x.to_vec()), [4, 1, 4]).exp()
         })
         .unwrap();
         let tape = Tape::new();
         let bound = params.bind(&tape);
-        let y = layer.forward(&bound, &[4, 1].into());
+        let y = layer.forward(&bound, [4, 1]);
         assert_eq!(y.value().as_slice(), [&table.as_slice()[12..15], &table.as_slice()[3..6]].concat());
-        assert_eq!(layer.forward(&bound, &[].into()).shape(), [0, 3]);
-        assert_eq!(layer.forward(&bound, &[].into()).sum().grad(&bound.vars())[0], Tensor::zeros(&[5, 3]));
+        let (list, shared) = (vec![4, 1], Arc::from([4, 1]));
+        for again in [
+            layer.forward(&bound, &list[..]),
+            layer.forward(&bound, &list),
+            layer.forward(&bound, &shared),
+            layer.forward(&bound, Indices::from(&shared)),
+            layer.forward(&bound, shared),
+            layer.forward(&bound, list),
+        ] {
+            assert_eq!(again.value(), y.value());
+        }
+        let error = tape.try_run(|| layer.forward(&bound, Indices::new(&[1, 2], [4, 1])).into_value()).unwrap_err();
+        assert!(error.to_string().contains("indices of shape [1, 2] are no list"), "{error}");
+        assert_eq!(layer.forward(&bound, []).shape(), [0, 3]);
+        assert_eq!(layer.forward(&bound, []).sum().grad(&bound.vars())[0], Tensor::zeros(&[5, 3]));
     }
 }

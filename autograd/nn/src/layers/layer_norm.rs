@@ -30,6 +30,16 @@ impl LayerNorm {
         LayerNorm { eps, ..self }
     }
 
+    /// The handle of the gain.
+    pub fn gain(&self) -> ParamId {
+        self.gain
+    }
+
+    /// The handle of the bias.
+    pub fn bias(&self) -> ParamId {
+        self.bias
+    }
+
     /// Computes the layer's output.
     ///
     /// ```

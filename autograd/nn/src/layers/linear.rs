@@ -45,6 +45,16 @@ impl Linear {
         }
     }
 
+    /// The handle of the weight.
+    pub fn weight(&self) -> ParamId {
+        self.weight
+    }
+
+    /// The handle of the bias, if there is one.
+    pub fn bias(&self) -> Option<ParamId> {
+        self.bias
+    }
+
     /// Computes the layer's output.
     ///
     /// # Panics

@@ -44,6 +44,11 @@ impl Mlp {
         Mlp { layers, skips: skips.into() }
     }
 
+    /// The dense layers in order.
+    pub fn layers(&self) -> &[Linear] {
+        &self.layers
+    }
+
     /// Computes the output of the last layer.
     ///
     /// # Panics

@@ -50,8 +50,9 @@ impl<'t, T: Scalar> Bound<'t, T> {
         self.vars.iter().filter(|var| var.is_on_graph()).collect()
     }
 
-    /// The gradients of a one-element tensor, one for each parameter that is not frozen, for
-    /// [`Optimizer::update`](crate::Optimizer::update).
+    /// The gradients of a one-element tensor, one for each parameter that is not frozen, in the order of the store.
+    /// They are for [`Optimizer::update`](crate::Optimizer::update). [`Params::grad`](crate::Params::grad) finds that
+    /// of a handle.
     ///
     /// This ends a training step. It drops the bound parameters and frees the recorded operations with the values that
     /// they hold. So an update changes the parameters in place; it copies a parameter first if other code still holds

@@ -1,7 +1,7 @@
 //! What a store of parameters does.
 
 use super::*;
-use crate::{Optimizer, Sgd, SgdConfig, Storage};
+use crate::{Optimizer, Sgd, SgdConfig, Storage, Tiles};
 
 #[test]
 fn frozen_parameters_rest_others_have_own_lr() {
@@ -71,6 +71,55 @@ fn handles_fit_copies_and_no_other_store() {
     other.freeze(|name| name == "z");
     params.assign(&other.cast::<f32>());
     assert_eq!((params.get(x).item(), params.get(z).item(), params.is_frozen(z)), (4.0, 5.0, true));
+}
+
+#[test]
+fn gradients_are_found_by_handle() {
+    let mut params = Params::<f64>::new();
+    let [a, b, c] = ["a", "b", "c"].map(|name| params.add(name, Tensor::scalar(1.0)));
+    params.freeze(|name| name == "b");
+    let of = |grads: &[Tensor<f64>]| [a, b, c].map(|id| params.grad(grads, id).map(Tensor::item));
+    let tape = Tape::new();
+    let bound = params.bind(&tape);
+    let loss = &bound[a] * 2.0 + &bound[b] * 3.0 + &bound[c] * 4.0;
+    assert_eq!(of(&loss.grad(&bound.vars())), [Some(2.0), None, Some(4.0)]);
+    let recorded = loss.grad_graph(&bound.vars());
+    assert_eq!(params.grad(&recorded, c).unwrap().item(), 4.0);
+    let grads = bound.backward(&loss);
+    assert_eq!(params.grad(&grads, c).unwrap().dense().unwrap().item(), 4.0);
+    let step = Tiles::<f64>::new().differentiate(&params, 2, |_, params, _| (&params[a] + &params[c] * 5.0, ()));
+    assert_eq!(params.grad(&step.grads, c).unwrap().dense().unwrap().item(), 10.0);
+    assert!(params.grad(&step.grads, b).is_none());
+    let stranger = Params::<f64>::new().add("a", Tensor::scalar(1.0));
+    assert!(panic_of(|| assert!(params.grad(&grads, stranger).is_none())).contains("a handle of another store"));
+    assert!(panic_of(|| assert!(params.grad(&grads[..1], a).is_none())).contains("one gradient for each parameter"));
+}
+
+#[test]
+fn layers_show_their_handles() {
+    use crate::{Conv2d, Init, LayerNorm, Linear, Mlp};
+    use rand::SeedableRng;
+    use raygrad_autograd::Activation;
+    let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(1);
+    let (mut params, none) = (Params::<f32>::new(), Activation::Identity);
+    let linear = Linear::new(&mut params, "linear", [2, 3], none, Init::Glorot, &mut rng);
+    let plain = Linear::without_bias(&mut params, "plain", [2, 3], none, Init::Glorot, &mut rng);
+    let conv = Conv2d::new(&mut params, "conv", [1, 2], [3, 3], Default::default(), none, Init::Glorot, &mut rng);
+    let norm = LayerNorm::new(&mut params, "norm", 3);
+    let mlp = Mlp::new(&mut params, "mlp", [2, 3, 2], &[], &mut rng);
+    assert!(plain.bias().is_none() && mlp.layers().len() == 2);
+    for (id, name) in [
+        (linear.weight(), "linear.weight"),
+        (linear.bias().unwrap(), "linear.bias"),
+        (plain.weight(), "plain.weight"),
+        (conv.weight(), "conv.weight"),
+        (conv.bias().unwrap(), "conv.bias"),
+        (norm.gain(), "norm.gain"),
+        (norm.bias(), "norm.bias"),
+        (mlp.layers()[1].weight(), "mlp.1.weight"),
+    ] {
+        assert_eq!(params.name(id), name);
+    }
 }
 
 #[test]
