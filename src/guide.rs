@@ -52,7 +52,8 @@
 //! * [`Tape::try_run`](crate::Tape::try_run) runs any code with plain methods and operators, and returns the first
 //!   error;
 //! * [`Tape::try_apply`](crate::Tape::try_apply) runs a single operation;
-//! * `grad`, `backward`, `grad_graph` and `vjp` have forms that begin with `try_`.
+//! * `grad`, `backward`, `grad_graph`, `vjp`, `jacobian`, `hessian` and `value_and_grad` have forms that begin with
+//!   `try_`.
 //!
 //! ```
 //! use raygrad::{Error, Tape, Tensor};

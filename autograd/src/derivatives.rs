@@ -20,7 +20,7 @@
 //! Where an operation is not differentiable, the [conventions](crate::conventions) apply.
 
 use crate::error::ensure;
-use crate::{Tape, Var};
+use crate::{Error, Tape, Var};
 use raygrad_tensor::{Scalar, Shape, Tensor};
 
 /// Runs `f` at `x` on a temporary tape, and `then` on the result and the leaves.
@@ -33,6 +33,18 @@ fn at<T: Scalar, R>(
     let leaves: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
     // A function that does not depend on its inputs has derivatives too, all of them 0.
     let y = f(&leaves).tracked();
+    then(y, &leaves.iter().collect::<Vec<_>>())
+}
+
+/// As [`at`], with the first error of `f` or of `then`.
+fn try_at<T: Scalar, R>(
+    f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
+    x: &[Tensor<T>],
+    then: impl for<'t> FnOnce(Var<'t, T>, &[&Var<'t, T>]) -> Result<R, Error>,
+) -> Result<R, Error> {
+    let tape = Tape::new();
+    let leaves: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
+    let y = tape.try_run(|| f(&leaves))?.tracked();
     then(y, &leaves.iter().collect::<Vec<_>>())
 }
 
@@ -56,6 +68,24 @@ pub fn value_and_grad<T: Scalar>(
     at(f, x, |y, wrt| (y.item(), y.grad(wrt)))
 }
 
+/// As [`value_and_grad`], with an error instead of a panic.
+///
+/// ```
+/// use raygrad_autograd::{Error, Tensor, derivatives::try_value_and_grad};
+/// let x = Tensor::from([3.0, -1.0]);
+/// let error = try_value_and_grad(|x| x[0].square(), &[x]).unwrap_err(); // not one element
+/// assert!(matches!(error, Error::NotScalar { .. }));
+/// ```
+///
+/// # Errors
+/// If the result has not exactly one element, or an operation of `f` fails, as in [`Tape::try_run`].
+pub fn try_value_and_grad<T: Scalar>(
+    f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
+    x: &[Tensor<T>],
+) -> Result<(T, Vec<Tensor<T>>), Error> {
+    try_at(f, x, |y, wrt| y.try_grad(wrt).map(|grads| (y.item(), grads)))
+}
+
 /// The value and the vector-Jacobian product (reverse mode): for each input, the gradient of `sum(f(x) * seed)`.
 ///
 /// ```
@@ -73,7 +103,7 @@ pub fn vjp<T: Scalar>(
     x: &[Tensor<T>],
     seed: &Tensor<T>,
 ) -> (Tensor<T>, Vec<Tensor<T>>) {
-    at(f, x, |y, wrt| (y.value().clone(), y.vjp_values(seed, wrt)))
+    at(f, x, |y, wrt| (y.value().clone(), y.tape().or_raise(y.vjp_values(seed, wrt))))
 }
 
 /// The value and the Jacobian-vector product (forward mode): the derivative of `f(x + h v)` by `h` at 0. It has the
@@ -113,6 +143,17 @@ pub fn jacobian<T: Scalar>(f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &
     at(f, x, |y, wrt| y.jacobian(wrt))
 }
 
+/// As [`jacobian`], with an error instead of a panic.
+///
+/// # Errors
+/// If an operation of `f` fails, as in [`Tape::try_run`].
+pub fn try_jacobian<T: Scalar>(
+    f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
+    x: &[Tensor<T>],
+) -> Result<Vec<Tensor<T>>, Error> {
+    try_at(f, x, |y, wrt| y.try_jacobian(wrt))
+}
+
 /// The Hessian of a function with a one-element result: `[i][j]` is the derivative of the gradient of input `i` by
 /// input `j`. Its shape is that of input `i` followed by that of input `j`.
 ///
@@ -130,6 +171,17 @@ pub fn jacobian<T: Scalar>(f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &
 #[track_caller]
 pub fn hessian<T: Scalar>(f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &[Tensor<T>]) -> Vec<Vec<Tensor<T>>> {
     at(f, x, |y, wrt| y.hessian(wrt))
+}
+
+/// As [`hessian`], with an error instead of a panic.
+///
+/// # Errors
+/// If the result has not exactly one element, or an operation of `f` fails, as in [`Tape::try_run`].
+pub fn try_hessian<T: Scalar>(
+    f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
+    x: &[Tensor<T>],
+) -> Result<Vec<Vec<Tensor<T>>>, Error> {
+    try_at(f, x, |y, wrt| y.try_hessian(wrt))
 }
 
 /// The Hessian-vector product of a function with a one-element result. `v` holds a tensor for each input. The work is
@@ -196,9 +248,22 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// fewer.
     ///
     /// # Panics
-    /// If the graph was freed, or if [`Tape::check_finite`] is on and finds a value that is not finite.
+    /// If the graph was freed, or if [`Tape::check_finite`] is on and finds a value that is not finite. If this tensor
+    /// or one of `wrt` is a constant, or if one of `wrt` belongs to another tape.
     #[track_caller]
     pub fn jacobian(&self, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
+        self.tape.or_raise(self.try_jacobian(wrt))
+    }
+
+    /// As [`jacobian`](Self::jacobian), with an error instead of a panic.
+    ///
+    /// # Errors
+    /// Where [`jacobian`](Self::jacobian) panics, except for a variable of another tape.
+    ///
+    /// # Panics
+    /// If one of `wrt` belongs to another tape.
+    #[track_caller]
+    pub fn try_jacobian(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Tensor<T>>, Error> {
         let inputs: usize = wrt.iter().map(|x| x.value.len()).sum();
         let outputs = self.value.len();
         let shape = |x: &Var<'t, T>| -> Shape { self.shape().iter().chain(x.shape()).copied().collect() };
@@ -206,25 +271,25 @@ impl<'t, T: Scalar> Var<'t, T> {
         if inputs >= outputs {
             // Row by row.
             for row in 0..outputs {
-                for (whole, grad) in all.iter_mut().zip(self.vjp_values(&unit(self.shape(), row), wrt)) {
+                for (whole, grad) in all.iter_mut().zip(self.vjp_values(&unit(self.shape(), row), wrt)?) {
                     let width = grad.len();
                     whole.as_mut_slice()[row * width..(row + 1) * width].copy_from_slice(grad.as_slice());
                 }
             }
-            return all;
+            return Ok(all);
         }
         // Column by column: the gradient by the seed of the vector-Jacobian product.
         let seed = self.tape.leaf(Tensor::zeros(self.shape()));
-        for (whole, grad) in all.iter_mut().zip(self.tape.enable_grad(|| self.vjp(&seed, wrt))) {
+        for (whole, grad) in all.iter_mut().zip(self.tape.enable_grad(|| self.try_vjp(&seed, wrt))?) {
             let width = grad.value.len();
             for column in 0..width {
-                let values = grad.vjp_values(&unit(grad.shape(), column), &[&seed]).remove(0);
+                let values = grad.vjp_values(&unit(grad.shape(), column), &[&seed])?.remove(0);
                 for (whole, &value) in whole.as_mut_slice()[column..].iter_mut().step_by(width).zip(values.as_slice()) {
                     *whole = value;
                 }
             }
         }
-        all
+        Ok(all)
     }
 
     /// The Hessian of this one-element tensor: `[i][j]` is the derivative of the gradient of `wrt[i]` by `wrt[j]`. Its
@@ -236,15 +301,27 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If this tensor has not exactly one element, and where [`jacobian`](Self::jacobian) panics.
     #[track_caller]
     pub fn hessian(&self, wrt: &[&Var<'t, T>]) -> Vec<Vec<Tensor<T>>> {
-        let grads = self.tape.enable_grad(|| self.grad_graph(wrt));
-        grads.iter().map(|grad| grad.jacobian(wrt)).collect()
+        self.tape.or_raise(self.try_hessian(wrt))
+    }
+
+    /// As [`hessian`](Self::hessian), with an error instead of a panic.
+    ///
+    /// # Errors
+    /// If this tensor has not exactly one element, and where [`try_jacobian`](Self::try_jacobian) fails.
+    ///
+    /// # Panics
+    /// If one of `wrt` belongs to another tape.
+    #[track_caller]
+    pub fn try_hessian(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Vec<Tensor<T>>>, Error> {
+        let grads = self.tape.enable_grad(|| self.try_grad_graph(wrt))?;
+        grads.iter().map(|grad| grad.try_jacobian(wrt)).collect()
     }
 
     /// The vector-Jacobian product without a record of it.
     #[track_caller]
-    fn vjp_values(&self, seed: &Tensor<T>, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
-        let grads = self.tape.no_grad(|| self.vjp(&self.tape.constant(seed.clone()), wrt));
-        grads.into_iter().map(Var::into_value).collect()
+    fn vjp_values(&self, seed: &Tensor<T>, wrt: &[&Var<'t, T>]) -> Result<Vec<Tensor<T>>, Error> {
+        let grads = self.tape.no_grad(|| self.try_vjp(&self.tape.constant(seed.clone()), wrt))?;
+        Ok(grads.into_iter().map(Var::into_value).collect())
     }
 
     /// This result as a constant if the tape does not record ([`Tape::no_grad`]).
@@ -281,7 +358,7 @@ fn unit<T: Scalar>(shape: &[usize], place: usize) -> Tensor<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Activation, Error};
+    use crate::Activation;
     use std::slice::from_ref;
 
     fn vector(values: &[f64]) -> Tensor<f64> {
@@ -433,6 +510,38 @@ mod tests {
         let (y, slope) = jvp(|x| x[0].constant(1.0), from_ref(&at), from_ref(&at));
         assert_eq!((y.item(), slope.item()), (1.0, 0.0));
         assert_eq!(hessian(|x| x[0].constant(1.0), &[at])[0][0], Tensor::scalar(0.0));
+    }
+
+    #[test]
+    fn try_forms_return_what_the_others_raise() {
+        let x = [vector(&AT)];
+        assert_eq!(try_value_and_grad(|x| curve(x).sum(), &x).unwrap(), value_and_grad(|x| curve(x).sum(), &x));
+        assert_eq!(try_jacobian(curve, &x).unwrap(), jacobian(curve, &x));
+        assert_eq!(try_hessian(|x| curve(x).sum(), &x).unwrap(), hessian(|x| curve(x).sum(), &x));
+        assert!(matches!(try_value_and_grad(curve, &x), Err(Error::NotScalar { .. })));
+        assert!(matches!(try_hessian(curve, &x), Err(Error::NotScalar { .. })));
+        // An operation of the function.
+        fn misfit<'t>(x: &[Var<'t, f64>]) -> Var<'t, f64> {
+            (&x[0] + Tensor::ones(&[3])).sum()
+        }
+        assert!(matches!(try_value_and_grad(misfit, &x), Err(Error::Shape { op: "add", .. })));
+        assert!(matches!(try_jacobian(misfit, &x), Err(Error::Shape { op: "add", .. })));
+        assert!(matches!(try_hessian(misfit, &x), Err(Error::Shape { op: "add", .. })));
+        // On a graph: by rows and by columns, and after the graph was freed.
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(vector(&AT));
+        let y = curve(from_ref(&x));
+        assert_eq!(y.try_jacobian(&[&x]).unwrap(), y.jacobian(&[&x]));
+        let constant = tape.constant(vector(&AT));
+        assert!(matches!(constant.try_jacobian(&[&x]), Err(Error::OfConstant { .. })));
+        assert!(matches!(y.try_jacobian(&[&constant]), Err(Error::ByConstant { .. })));
+        assert!(matches!(y.sum().try_hessian(&[&constant]), Err(Error::ByConstant { .. })));
+        let sum = y.sum();
+        tape.free();
+        for y in [&y, &sum] {
+            assert!(matches!(y.try_jacobian(&[&x]), Err(Error::Freed { .. })));
+        }
+        assert!(matches!(sum.try_hessian(&[&x]), Err(Error::Freed { .. })));
     }
 
     #[test]
