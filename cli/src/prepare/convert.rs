@@ -360,7 +360,8 @@ fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> 
         let mut to = view.clone();
         to.image = view.image.as_ref().map(|_| folder.join(&image));
         to.name = name;
-        // COLMAP's naming.
+        // Written masks are white for used pixels. COLMAP's naming.
+        to.mask_is_dynamic = false;
         to.mask = view.mask.as_ref().filter(|_| has_masks).map(|_| folder.join("masks").join(format!("{inner}.png")));
         to.depth = view.depth.as_ref().filter(|_| has_depths).map(|(path, unit)| {
             let ending = path.extension().unwrap_or_default();
@@ -445,8 +446,9 @@ impl Job {
         Photo::open(source, None)?;
         copy_file(source, image)?;
         let (Some(from), Some(to)) = (&from.mask, &to.mask) else { return Ok(()) };
-        let mask = Photo::open(from, None)?;
-        if from.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png")) {
+        let Some(mask) = self.from.mask_photo(None)? else { return Ok(()) };
+        let is_png = from.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png"));
+        if is_png && !self.from.mask_is_dynamic {
             return copy_file(from, to);
         }
         make_parent(to)?;
@@ -490,6 +492,30 @@ mod tests {
             assert_eq!(of(target, rest), pair(image, name), "{rest} {target:?}");
         }
     }
+
+    #[test]
+    fn dynamic_masks_become_masks_of_used_pixels() {
+        use raygrad::nerf::dataset::Image;
+        let place = tempfile::tempdir().unwrap();
+        let [image, mask] = ["images/0.png", "images/dynamic_mask_0.png"].map(|name| place.path().join(name));
+        make_parent(&image).unwrap();
+        Image::new(4, 3, 3).save_png(&image).unwrap();
+        let mut ignored = Image::new(4, 3, 3);
+        ignored.pixel_mut(1, 2)[2] = 0.5;
+        ignored.save_png(&mask).unwrap();
+        let camera = Camera::from_angle(4, 3, 1.0, DAffine3::IDENTITY);
+        let view = View { image: Some(image), mask: Some(mask), ..View::new("images/0.png", "frames[0]", camera) };
+        let view = View { mask_is_dynamic: true, ..view };
+        let file = place.path().join("transforms.json");
+        let capture = Capture::new(place.path(), file, Format::Transforms, vec![view]);
+        let jobs = jobs(&capture, Target::Nerfstudio, false, &place.path().join("made")).unwrap();
+        jobs[0].run().unwrap();
+        assert!(!jobs[0].to.mask_is_dynamic);
+        let made = Photo::open(jobs[0].to.mask.as_ref().unwrap(), None).unwrap();
+        let black: Vec<usize> = made.pixels().enumerate().filter(|(_, p)| p[0] == 0.0).map(|(i, _)| i).collect();
+        assert_eq!(black, [9]);
+    }
+
     #[test]
     fn lost_parts_are_named_for_each_format() {
         let view = |split| View {

@@ -122,7 +122,7 @@ impl PhotoCache {
     /// appearance embedding.
     pub fn is_special(&self, number: usize, model: &Model<f32>) -> bool {
         let own = |entry: &Entry| Appearance::of(model, entry.split, false) == Appearance::Own;
-        let is_masked = |entry: &Entry| entry.view.mask.is_some() && !self.mask_as_alpha;
+        let is_masked = |entry: &Entry| entry.view.mask.is_some() && !(self.mask_as_alpha && entry.view.has_cutout());
         let is_weighted = |entry: &Entry| is_masked(entry) || entry.given.lens == Lens::Equirectangular;
         self.entries.get(number).is_some_and(|entry| is_weighted(entry) || own(entry))
     }
@@ -313,6 +313,8 @@ mod tests {
         assert!(photos.is_special(0, &model) && !photos.is_special(1, &model));
         photos.mask_as_alpha = true;
         assert!(!photos.is_special(0, &model), "the page shows the same alpha");
+        photos.entries[0].view.mask_is_dynamic = true;
+        assert!(photos.is_special(0, &model), "such a mask cuts out nothing");
         photos.mask_as_alpha = false;
         photos.entries[0].view.mask = None;
         photos.entries[0].given.lens = Lens::Equirectangular;

@@ -106,6 +106,8 @@ pub struct View {
     pub split: Option<Split>,
     /// The mask file, if there is one: black where pixels are not used.
     pub mask: Option<PathBuf>,
+    /// Whether the mask is a dynamic mask of instant-ngp: black where pixels are used. Such masks cut out no object.
+    pub mask_is_dynamic: bool,
     /// A depth file (along the optical axis), and the length of its unit in units of the capture.
     pub depth: Option<(PathBuf, f64)>,
     /// The sharpness in the file, in the writing program's unit; more is sharper.
@@ -118,7 +120,8 @@ impl View {
     /// Creates a view with a name, an entry for errors and a camera, and nothing else.
     pub fn new(name: impl Into<String>, field: impl Into<String>, camera: Camera) -> Self {
         let (image, split, mask, depth, sharpness, bounds) = (None, None, None, None, None, None);
-        View { name: name.into(), field: field.into(), image, camera, split, mask, depth, sharpness, bounds }
+        let (name, field, mask_is_dynamic) = (name.into(), field.into(), false);
+        View { name, field, image, camera, split, mask, mask_is_dynamic, depth, sharpness, bounds }
     }
 }
 

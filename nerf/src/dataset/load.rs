@@ -355,7 +355,7 @@ impl<'a> Plan<'a> {
         let header = Header::read(&path)?;
         let size = fitting(&header, &path, &view.camera)?;
         let to = size.map(|side| ((side as f64 / downscale as f64).round() as usize).max(1));
-        let is_cut = mask_as_alpha && view.mask.is_some();
+        let is_cut = mask_as_alpha && view.has_cutout();
         if mask_as_alpha && !is_cut && header.channels == 3 {
             // Other images say that its background is empty.
             let what = "has no mask to cut out the object, and no transparency: add its mask, or use masks to ignore \
@@ -394,7 +394,7 @@ impl<'a> Plan<'a> {
         let photo = if *is_cut { cut_out(photo, view)? } else { photo };
         let image = if [photo.width, photo.height] == *to { photo } else { photo.resized(*to) };
         let camera = view.camera.resized(to[0], to[1]);
-        let given = view.mask.as_ref().filter(|_| !is_cut).map(|path| used_pixels(path, *size, *to)).transpose()?;
+        let given = if *is_cut { None } else { used_pixels(view, *size, *to)? };
         let mask = match (given, lit.of(&camera)) {
             (Some(given), Some(lit)) => {
                 Some(Arc::new(Mask::new(to[0], to[1], |x, y| given.uses(x, y) && lit.uses(x, y))))
@@ -415,6 +415,21 @@ impl<'a> Plan<'a> {
 }
 
 impl View {
+    /// Returns whether there is a mask that can cut out an object.
+    pub fn has_cutout(&self) -> bool {
+        self.mask.is_some() && !self.mask_is_dynamic
+    }
+
+    /// Reads the mask, if there is one, white for used pixels. `size` is that of [`Photo::open`].
+    ///
+    /// # Errors
+    /// As [`Photo::open`].
+    pub fn mask_photo(&self, size: Option<[usize; 2]>) -> Result<Option<Photo>> {
+        let Some(path) = &self.mask else { return Ok(None) };
+        let mask = Photo::open(path, size)?;
+        Ok(Some(if self.mask_is_dynamic { mask.inverted() } else { mask }))
+    }
+
     /// Returns the most bytes of memory while the image, its mask and its depths are decoded; without those whose
     /// headers cannot be read, as decoding reports their errors.
     pub fn decoding_memory(&self) -> u64 {
@@ -478,15 +493,18 @@ pub(crate) fn same_shape([width, height]: [usize; 2], camera: &Camera) -> bool {
 
 /// Makes the pixels transparent that the mask of a view, if there is one, does not use.
 fn cut_out(photo: Photo, view: &View) -> Result<Photo> {
-    let Some(mask) = &view.mask else { return Ok(photo) };
     let size = [photo.width, photo.height];
-    Ok(photo.masked(&read_mask(mask, size, size)?))
+    let mask = if view.has_cutout() { read_mask(view, size, size)? } else { None };
+    Ok(match mask {
+        Some(mask) => photo.masked(&mask),
+        None => photo,
+    })
 }
 
 /// Reads the used pixels of an image of the size `of`, downscaled to the size `to`, from its mask.
-fn used_pixels(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
-    let mask = read_mask(path, of, to)?;
-    Ok(Mask::new(to[0], to[1], |x, y| mask.pixel(x, y)[0] >= WHITE))
+fn used_pixels(view: &View, of: [usize; 2], to: [usize; 2]) -> Result<Option<Mask>> {
+    let mask = read_mask(view, of, to)?;
+    Ok(mask.map(|mask| Mask::new(to[0], to[1], |x, y| mask.pixel(x, y)[0] >= WHITE)))
 }
 
 /// Returns true if the aspect ratios of a mask and its image agree, up to a pixel of the smaller.
@@ -495,9 +513,9 @@ pub(crate) fn mask_fits(mask: [usize; 2], image: [usize; 2]) -> bool {
     (mask[0] * image[1]).abs_diff(mask[1] * image[0]) <= longest
 }
 
-/// Opens a mask, white for used pixels, in the orientation of the size `of`.
-pub(super) fn open_mask(path: &Path, of: [usize; 2]) -> Result<Photo> {
-    let mask = Photo::open(path, Some(of))?;
+/// Opens the mask of a view, white for used pixels, in the orientation of the size `of`.
+pub(super) fn open_mask(view: &View, of: [usize; 2]) -> Result<Option<Photo>> {
+    let (Some(path), Some(mask)) = (&view.mask, view.mask_photo(Some(of))?) else { return Ok(None) };
     // Transparent pixels are black, whatever their colour.
     let mask = if mask.has_alpha() { mask.to_image().over([0.0; 3]).into() } else { mask };
     let most = mask.pixels().map(|pixel| pixel[0]).fold(0.0, f32::max);
@@ -508,22 +526,22 @@ pub(super) fn open_mask(path: &Path, of: [usize; 2]) -> Result<Photo> {
         );
         return Err(Error::file(path, what));
     }
-    Ok(mask)
+    Ok(Some(mask))
 }
 
-/// Reads a mask of an image of the size `of`, resampled to the size `to`.
-fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Photo> {
-    let mask = open_mask(path, of)?;
+/// Reads the mask of an image of the size `of`, resampled to the size `to`.
+fn read_mask(view: &View, of: [usize; 2], to: [usize; 2]) -> Result<Option<Photo>> {
+    let (Some(path), Some(mask)) = (&view.mask, open_mask(view, of)?) else { return Ok(None) };
     let from = [mask.width, mask.height];
     if !mask_fits(from, of) {
         let what =
             format!("has {}x{} pixels but its image {}x{}; use one aspect ratio", from[0], from[1], of[0], of[1]);
         return Err(Error::file(path, what));
     }
-    Ok(match (0..2).all(|axis| from[axis] >= to[axis]) {
+    Ok(Some(match (0..2).all(|axis| from[axis] >= to[axis]) {
         true => mask.resized(to),
         false => mask.resampled(to, |place| [0, 1].map(|axis| place[axis] * from[axis] as f64 / to[axis] as f64)),
-    })
+    }))
 }
 
 /// The pixels that each lens sees, computed once per camera.

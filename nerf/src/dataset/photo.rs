@@ -262,6 +262,16 @@ impl Photo {
         Photo { width, height, channels: self.channels, values }
     }
 
+    /// Converts a dynamic mask of instant-ngp to one of used pixels: black pixels become white, and others black.
+    pub(super) fn inverted(mut self) -> Photo {
+        match &mut self.values {
+            Values::Bytes(values) => invert(values, self.channels),
+            Values::Words(values) => invert(values, self.channels),
+            Values::Floats(values) => invert(values, self.channels),
+        }
+        self
+    }
+
     /// Multiplies alpha by the red values of a mask of the same size, so that its black pixels become transparent.
     pub(super) fn masked(&self, mask: &Photo) -> Photo {
         let alpha = mask.pixels().map(|pixel| pixel[0]);
@@ -271,6 +281,15 @@ impl Photo {
             Values::Floats(values) => Values::Floats(with_alpha(values, self.channels, alpha)),
         };
         Photo { width: self.width, height: self.height, channels: 4, values }
+    }
+}
+
+/// Makes black pixels white and others black, without transparency: instant-ngp ignores that of its masks.
+fn invert<S: Stored>(values: &mut [S], channels: usize) {
+    for pixel in values.chunks_exact_mut(channels) {
+        let is_used = pixel[..3].iter().all(|value| value.unit() == 0.0);
+        pixel.fill(S::nearest(f64::from(u8::from(is_used))));
+        pixel[3..].fill(S::nearest(1.0));
     }
 }
 

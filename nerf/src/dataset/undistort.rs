@@ -118,8 +118,11 @@ impl View {
             photo.resampled(size, |pixel| place(to, &from, pixel))
         };
         let photo = moved(&open(image, &self.camera)?);
-        let Some(mask) = &self.mask else { return Ok((photo, None)) };
-        let mask = moved(&open_mask(mask, size_for(mask, &self.camera)?)?);
+        let mask = match &self.mask {
+            Some(path) => open_mask(self, size_for(path, &self.camera)?)?,
+            None => None,
+        };
+        let Some(mask) = mask.map(|mask| moved(&mask)) else { return Ok((photo, None)) };
         let data = mask.pixels().map(|pixel| f32::from(u8::from(pixel[0] >= WHITE))).collect();
         Ok((photo, Some(Image { width: size[0], height: size[1], channels: 1, data })))
     }

@@ -62,7 +62,7 @@ fn look_at(view: &View) -> Result<Look> {
     let transparent = photo.has_alpha().then(|| photo.transparent_share() > 0.0);
     let middle = shrunk(&photo, LONGEST);
     let small = shrunk(&photo, SMALL);
-    let mask = view.mask.as_ref().map(|path| Photo::open(path, None)).transpose()?;
+    let mask = view.mask_photo(None)?;
     let used = mask
         .as_ref()
         .map(|mask| mask.pixels().filter(|pixel| pixel[0] >= 0.99).count() as f64 / (mask.width * mask.height) as f64);
@@ -132,6 +132,20 @@ fn light(image: &Image) -> (Option<f64>, [f64; 2]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::pinhole::Camera;
+
+    #[test]
+    fn black_pixels_of_dynamic_masks_are_used() {
+        let folder = tempfile::tempdir().unwrap();
+        let [image, mask] = ["0.png", "dynamic_mask_0.png"].map(|name| folder.path().join(name));
+        Image::new(8, 6, 3).save_png(&image).unwrap();
+        Image::new(8, 6, 1).save_png(&mask).unwrap();
+        let camera = Camera::from_angle(8, 6, 0.7, glam::DAffine3::IDENTITY);
+        let mut view = View { image: Some(image), mask: Some(mask), ..View::new("0.png", "frames[0]", camera) };
+        assert_eq!(look_at(&view).unwrap().used, Some(0.0));
+        view.mask_is_dynamic = true;
+        assert_eq!(look_at(&view).unwrap().used, Some(1.0));
+    }
 
     #[test]
     fn sharpness_does_not_change_with_brightness() {

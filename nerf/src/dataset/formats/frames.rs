@@ -74,7 +74,7 @@ impl Frames {
             out.assumptions.push(format!("left out {count} of {total} frames without a finite pose, such as `{name}`"));
         }
         out.assumptions.extend(moving(&all));
-        out.assumptions.extend(unread_masks(out.views.iter().flatten()));
+        out.assumptions.extend(attach_dynamic_masks(out.views.iter_mut().flatten()));
         Ok(out)
     }
 
@@ -133,17 +133,26 @@ fn moving(frames: &[&Object<'_>]) -> Option<String> {
     times.any(|time| time != first).then(|| what.to_owned())
 }
 
-/// A note on instant-ngp's masks of what moves, which stand beside images.
-fn unread_masks<'a>(views: impl Iterator<Item = &'a View>) -> Option<String> {
-    let beside = |view: &View| {
-        let image = view.image.as_ref().filter(|_| view.mask.is_none())?;
-        let name = format!("dynamic_mask_{}.png", image.file_stem()?.to_str()?);
-        image.with_file_name(&name).is_file().then_some(name)
-    };
-    let names: Vec<String> = views.filter_map(beside).collect();
-    let (first, count) = (names.first()?, names.len());
+/// Sets instant-ngp's masks of moving objects, which stand beside images, where a view has no other. Returns a note.
+fn attach_dynamic_masks<'a>(views: impl Iterator<Item = &'a mut View>) -> Option<String> {
+    let (mut first, mut count, mut present) = (None, 0, 0);
+    for view in views {
+        let Some(image) = &view.image else { continue };
+        present += 1;
+        let Some(stem) = image.file_stem().and_then(|stem| stem.to_str()).filter(|_| view.mask.is_none()) else {
+            continue;
+        };
+        let name = format!("dynamic_mask_{stem}.png");
+        let mask = image.with_file_name(&name);
+        if mask.is_file() {
+            (view.mask, view.mask_is_dynamic) = (Some(mask), true);
+            first.get_or_insert(name);
+            count += 1;
+        }
+    }
     Some(format!(
-        "masks such as `{first}` ({count}) are not read: invert them (white for pixels to use), named as `mask_path`"
+        "{count} of {present} images have a dynamic mask of instant-ngp, such as `{}`: used only its black pixels",
+        first?
     ))
 }
 

@@ -137,7 +137,8 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
         let mut frame = if shared { Map::new() } else { own };
         frame.insert("file_path".into(), file_path(view).into());
         frame.insert("transform_matrix".into(), matrix::to_json(view.camera.pose, 4));
-        if let Some(mask) = &view.mask {
+        // Readers find dynamic masks beside the images.
+        if let Some(mask) = view.mask.as_ref().filter(|_| !view.mask_is_dynamic) {
             frame.insert("mask_path".into(), relative(capture, folder, mask, &file)?.into());
         }
         if let Some((depth, own)) = &view.depth {

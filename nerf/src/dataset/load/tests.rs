@@ -221,6 +221,52 @@ fn masks_drop_black_and_unlit_pixels() {
 }
 
 #[test]
+fn dynamic_masks_use_only_their_black_pixels() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 4);
+    capture.split_by_default();
+    let path = folder.path().join("mask.png");
+    let save = |channels: usize, pixels: &[([usize; 2], &[f32])]| {
+        let mut mask = Image::new(12, 8, channels);
+        pixels.iter().for_each(|(at, value)| mask.pixel_mut(at[0], at[1]).copy_from_slice(value));
+        mask.save_png(&path).unwrap();
+    };
+    capture.views.iter_mut().for_each(|view| (view.mask, view.mask_is_dynamic) = (Some(path.clone()), true));
+    let analysis = capture.analyze_scene(None).unwrap();
+    let unused = |options: &LoadOptions<'_>| {
+        let frame = capture.load(Split::Train, &analysis, options).unwrap().frames.swap_remove(0);
+        let used = frame.mask.unwrap();
+        let [width, height] = used.size();
+        let all = (0..height).flat_map(|y| (0..width).map(move |x| [x, y]));
+        all.filter(|[x, y]| !used.uses(*x, *y)).collect::<Vec<_>>()
+    };
+    let options = LoadOptions::default();
+    // Any value above 0 in any colour, also where it is transparent.
+    save(3, &[([3, 2], &[1.0; 3]), ([4, 2], &[0.0, 0.0, 0.004]), ([7, 7], &[0.0, 0.5, 0.0])]);
+    assert_eq!(unused(&options), [[3, 2], [4, 2], [7, 7]]);
+    assert_eq!(unused(&LoadOptions { downscale: 2, ..options }), [[1, 1], [2, 1], [3, 3]], "no part of a pixel");
+    save(1, &[([0, 0], &[0.004])]);
+    assert_eq!(unused(&options), [[0, 0]], "a mask of small values is none of object numbers");
+    save(4, &[([5, 1], &[1.0, 1.0, 1.0, 0.0]), ([6, 1], &[1.0; 4])]);
+    assert_eq!(unused(&options), [[5, 1], [6, 1]]);
+    let to = capture.views[0].camera_of_image().unwrap();
+    let undistorted = capture.views[0].seen_by(&to).unwrap().1.unwrap();
+    let black = undistorted.data.iter().enumerate().filter(|(_, value)| **value == 0.0).map(|(i, _)| [i % 12, i / 12]);
+    assert!(black.clone().count() > 0 && black.clone().all(|[x, y]| (4..8).contains(&x) && y < 3), "around two pixels");
+    // They cut out no object: moving people would become empty space.
+    let alpha = LoadOptions { mask_as_alpha: true, ..options };
+    let message = capture.load(Split::Train, &analysis, &alpha).unwrap_err().to_string();
+    assert!(message.contains("has no mask to cut out the object"), "{message}");
+    for view in capture.present() {
+        Image { data: vec![1.0; 12 * 8 * 4], ..Image::new(12, 8, 4) }.save_png(view.image.as_ref().unwrap()).unwrap();
+    }
+    assert_eq!(unused(&alpha), [[5, 1], [6, 1]]);
+    assert_eq!(capture.cutout(&capture.views[0]).unwrap().transparent_share(), 0.0);
+    save(3, &[]);
+    assert_eq!(unused(&options).len(), 0);
+}
+
+#[test]
 fn masks_as_alpha_cut_out_the_object() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
@@ -454,8 +500,9 @@ fn transparent_pixels_of_a_mask_are_black_at_each_size() {
     let mut mask = Image { width: 8, height: 8, channels: 4, data: vec![1.0; 8 * 8 * 4] };
     (0..4).for_each(|y| (0..8).for_each(|x| mask.pixel_mut(x, y)[3] = 0.0));
     mask.save_png(&path).unwrap();
+    let view = View { mask: Some(path), ..View::new("", "", Camera::from_angle(16, 16, 0.8, DAffine3::IDENTITY)) };
     for side in [8, 4, 16] {
-        let mask = used_pixels(&path, [16, 16], [side; 2]).unwrap();
+        let mask = used_pixels(&view, [16, 16], [side; 2]).unwrap().unwrap();
         assert!(!mask.uses(side / 2, 0) && mask.uses(side / 2, side - 1), "{side}");
     }
 }

@@ -407,23 +407,38 @@ fn masks_take_no_place_of_images() {
 }
 
 #[test]
-fn moving_scenes_and_unread_masks_give_notes() {
+fn moving_scenes_give_notes() {
     let timed = |times: [f64; 3]| {
         let set = |d: &mut Value| (0..3).for_each(|i| d["frames"][i]["time"] = json!(times[i]));
         good(set).assumptions
     };
     assert_eq!(timed([0.5; 3]), [""; 0]);
     assert!(matches!(&timed([0.0, 0.0, 1.0])[..], [note] if note.contains("`time`") && note.contains("still scene")));
+}
+
+#[test]
+fn dynamic_masks_beside_images_are_used_where_no_other_is_given() {
     let masked = |mask: bool| {
         let folder = folder(|d| {
             if mask {
                 d["frames"][1]["mask_path"] = json!("images/dynamic_mask_1.png");
             }
         });
-        picture(&folder.path().join("images/dynamic_mask_1.png"), 8, 6);
-        read(folder.path()).unwrap().assumptions
+        for name in ["images/dynamic_mask_1.png", "images/dynamic_mask_2.png", "dynamic_mask_0.png"] {
+            picture(&folder.path().join(name), 8, 6);
+        }
+        let capture = read(folder.path()).unwrap();
+        let masks = capture.views.iter().map(|view| (view.mask.clone(), view.mask_is_dynamic));
+        let expected = [None, Some(folder.path().join("images/dynamic_mask_1.png")), None];
+        assert_eq!(masks.collect::<Vec<_>>(), expected.map(|path| (path.clone(), path.is_some() && !mask)));
+        let again = tempfile::tempdir().unwrap();
+        write(&capture, again.path()).unwrap();
+        let written = std::fs::read_to_string(file(again.path())).unwrap();
+        assert_eq!(written.contains("mask_path"), mask, "readers find dynamic masks beside the images");
+        capture.assumptions
     };
-    assert_eq!(masked(true), [""; 0]);
-    let expected = "masks such as `dynamic_mask_1.png` (1) are not read: invert them";
-    assert!(matches!(&masked(false)[..], [note] if note.starts_with(expected)));
+    assert_eq!(masked(true), [""; 0], "masks that are named count as others do");
+    let expected = "1 of 2 images have a dynamic mask of instant-ngp, such as `dynamic_mask_1.png`: used only its \
+                    black pixels";
+    assert_eq!(masked(false), [expected]);
 }

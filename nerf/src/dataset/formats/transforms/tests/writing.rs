@@ -30,6 +30,7 @@ fn capture(folder: &Path) -> Capture {
             camera: camera(i),
             split: Some(Split::ALL[i]),
             mask: Some(mask),
+            mask_is_dynamic: false,
             depth: Some((depth, 0.1 / 3.0)),
             sharpness: Some(10.0 / 3.0),
             bounds: None,
