@@ -481,4 +481,4 @@ fn chunks_fit(reader: &mut (impl Read + Seek), length: u64) -> std::io::Result<b
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -9,7 +9,7 @@ use crate::dataset::capture::View;
 use crate::dataset::photo::Photo;
 use crate::error::{Error, Result};
 use serde_json::Value;
-use std::collections::HashSet;
+use std::collections::{BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
 /// The unit of integer depth images in nerfstudio: a millimetre in scenes in metres.
@@ -91,7 +91,7 @@ impl Frames {
         let masks = files(&all, "mask_path", folder, taken, &mut self.assumptions)?;
         let depths = Depths::of(top, &all, (folder, taken), &mut self.assumptions)?;
         let first = frames.iter().zip(images).find_map(|(frame, (_, image))| Some((frame, image.as_ref()?)));
-        let mut common = None;
+        let (mut common, mut turned) = (None, BTreeSet::new());
         let mut views = Vec::with_capacity(frames.len());
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
             check_known(frame)?;
@@ -107,8 +107,12 @@ impl Frames {
                 // An absent image is assumed to be as large as the first.
                 let own = image.as_ref().filter(|_| dialect == Dialect::Transforms).map(|image| (frame, image));
                 match (own, first) {
-                    (Some(own), _) => size(own),
-                    (None, Some(first)) => common.map_or_else(|| size(first), Ok).inspect(|size| common = Some(*size)),
+                    (Some(own), _) => size(own, &mut turned),
+                    (None, Some(first)) => {
+                        let size = common.map_or_else(|| size(first, &mut turned), Ok)?;
+                        common = Some(size);
+                        Ok(size)
+                    }
                     (None, None) => Ok([0, 0]),
                 }
             };
@@ -120,6 +124,13 @@ impl Frames {
                 sharpness: frame.number("sharpness")?,
                 ..View::new(name, &frame.path, camera)
             });
+        }
+        if let Some(first) = turned.first() {
+            let (count, first) = (turned.len(), first.strip_prefix(folder).unwrap_or(first).display());
+            self.assumptions.push(format!(
+                "{count} images have an EXIF orientation but no `w` and `h`, such as `{first}`: used their pixels as \
+                 stored; give the width and height of the turned images to turn them"
+            ));
         }
         Ok(views)
     }
@@ -175,12 +186,17 @@ fn files(
     Ok(names.into_iter().map(|name| Some((name?, found.next().flatten()))).collect())
 }
 
-/// The size of a frame's image, from its header.
-fn size((frame, image): (&Object<'_>, &Located)) -> Result<[usize; 2]> {
-    Photo::size_of_file(&image.path).map(|[_, shown]| shown.map(|side| side * image.factor)).map_err(|e| match e {
+/// The stored size of a frame's image, from its header. Programs that measure cameras read no EXIF orientation; images
+/// with one of another size are added to `turned`.
+fn size((frame, image): (&Object<'_>, &Located), turned: &mut BTreeSet<PathBuf>) -> Result<[usize; 2]> {
+    let [stored, shown] = Photo::size_of_file(&image.path).map_err(|e| match e {
         Error::File { path, what } => frame.error("file_path", format!("{}: {what}", path.display())),
         other => other,
-    })
+    })?;
+    if stored != shown {
+        turned.insert(image.path.clone());
+    }
+    Ok(stored.map(|side| side * image.factor))
 }
 
 /// The file that accompanies an image. It must exist if the image does.

@@ -221,6 +221,59 @@ fn masks_drop_black_and_unlit_pixels() {
 }
 
 #[test]
+fn turned_photos_follow_the_size_of_their_camera_in_every_format() {
+    let transforms = |folder: &Path, [w, h]: [usize; 2]| {
+        let pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4]];
+        let frames = serde_json::json!([{ "file_path": "images/0.jpg", "transform_matrix": pose }]);
+        let mut document = serde_json::json!({ "fl_x": 20, "frames": frames });
+        if w > 0 {
+            (document["w"], document["h"]) = (w.into(), h.into());
+        }
+        std::fs::write(folder.join("transforms.json"), document.to_string()).unwrap();
+    };
+    let capture = |folder: &Path, [w, h]: [usize; 2], format: Format| {
+        let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::ZERO, DVec3::Z);
+        let image = Some(folder.join("images/0.jpg"));
+        let view =
+            View { image, bounds: Some([1.0, 2.0]), ..View::new("0.jpg", "0", Camera::from_angle(w, h, 0.8, pose)) };
+        Capture::new(folder, folder.join("capture"), format, vec![view])
+    };
+    let colmap = |folder: &Path, size: [usize; 2]| {
+        let encoding = formats::colmap::Encoding::Binary;
+        formats::colmap::write(&capture(folder, size, Format::Colmap), folder, encoding).unwrap();
+    };
+    let llff = |folder: &Path, size: [usize; 2]| {
+        formats::llff::write(&capture(folder, size, Format::Llff), folder).unwrap();
+    };
+    // The size of the camera, and the corner with the white quarter, if the image is turned as 6 asks or not.
+    let sized = [([16, 8], 0), ([8, 16], 1), ([32, 16], 0), ([16, 32], 1)];
+    let without = [([0, 0], 0)];
+    type Writer<'a> = &'a dyn Fn(&Path, [usize; 2]);
+    let formats: [(Writer<'_>, Vec<_>); 3] =
+        [(&transforms, sized.into_iter().chain(without).collect()), (&colmap, sized.to_vec()), (&llff, sized.to_vec())];
+    for (format, (write, cases)) in formats.into_iter().enumerate() {
+        for (size, corner) in cases {
+            let folder = tempfile::tempdir().unwrap();
+            std::fs::create_dir(folder.path().join("images")).unwrap();
+            std::fs::write(folder.path().join("images/0.jpg"), crate::dataset::photo::tests::jpeg(6)).unwrap();
+            write(folder.path(), size);
+            let capture = Capture::read(folder.path()).unwrap();
+            let camera = &capture.views[0].camera;
+            assert_eq!([camera.width, camera.height], if size == [0, 0] { [16, 8] } else { size });
+            let note = "1 images have an EXIF orientation but no `w` and `h`, such as `images/0.jpg`: used their \
+                        pixels as stored; give the width and height of the turned images to turn them";
+            assert_eq!(capture.assumptions, if size == [0, 0] { vec![note] } else { vec![] });
+            let photo = capture.photo(&capture.views[0]).unwrap();
+            let [w, h] = [photo.width, photo.height];
+            let seen = [[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]].map(|[x, y]| photo.pixel(x, y)[0] > 0.5);
+            assert_eq!(seen, [0, 1, 2, 3].map(|i| i == corner), "format {format}, {size:?}");
+            let plan = Plan::new(&capture, &capture.views[0], LoadOptions::default()).unwrap();
+            assert_eq!([plan.size, [w, h]], [if corner == 0 { [16, 8] } else { [8, 16] }; 2]);
+        }
+    }
+}
+
+#[test]
 fn dynamic_masks_use_only_their_black_pixels() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
