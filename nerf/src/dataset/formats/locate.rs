@@ -1,10 +1,10 @@
 //! Finds the files of a capture that was moved or renamed after its description was written.
 //!
 //! A listed path counts as it stands. If no file of a listed folder exists, the folder with the longest common end of
-//! the path takes its place. Letter case and the extension of an image may differ. Two folders or files that fit
-//! equally well are an error.
+//! the path takes its place. Letter case, Unicode normal form and the extension of an image may differ. Two folders or
+//! files that fit equally well are an error.
 
-use super::paths::{self, extension};
+use super::paths::{self, composed, extension, folded};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::ffi::OsString;
@@ -78,8 +78,9 @@ pub(super) fn locate(
             let mut fitting: Vec<PathBuf> = directories.iter().flat_map(|directory| of(directory)).collect();
             let Some(file) = fitting.pop() else { continue };
             if let Some(other) = fitting.pop() {
-                let [one, two] = [&other, &file].map(|path| path.display());
-                let what = format!("`{}` does not exist; `{one}` and `{two}` fit: correct the path", names[i]);
+                let [one, two] = [&other, &file].map(|path| path.display().to_string());
+                let form = other_form(&one, &two);
+                let what = format!("`{}` does not exist; `{one}` and `{two}`{form} fit: correct the path", names[i]);
                 return Err((i, what));
             }
             if let Some(&other) = owners.get(&file).filter(|&&other| names[other] != names[i]) {
@@ -98,7 +99,8 @@ pub(super) fn locate(
                 1 => ", and 1 file likewise".to_owned(),
                 others => format!(", and {others} files likewise"),
             };
-            assumptions.push(format!("`{}` does not exist: used `{file}`{rest}", names[i]));
+            let form = other_form(names[i], &file);
+            assumptions.push(format!("`{}` does not exist: used `{file}`{form}{rest}", names[i]));
         }
     }
     Ok(found)
@@ -110,10 +112,19 @@ fn split(path: &str) -> [&str; 2] {
     [place, name]
 }
 
-/// A file name in lower case, without the extension of an image.
+/// Says that two paths look alike, but their characters differ.
+fn other_form(one: &str, two: &str) -> &'static str {
+    if one != two && folded(one) == folded(two) && one.to_lowercase() != two.to_lowercase() {
+        " (in another Unicode normal form)"
+    } else {
+        ""
+    }
+}
+
+/// A folded file name, without the extension of an image.
 pub(super) fn stem(name: &str) -> String {
     let ending = extension(name).map_or(0, |ending| ending.len() + 1);
-    name[..name.len() - ending].to_lowercase()
+    folded(&name[..name.len() - ending])
 }
 
 /// The files of a folder.
@@ -143,16 +154,20 @@ impl Directory {
         Directory::new(inside.to_owned(), names)
     }
 
-    /// The files that fit a name best: of the same name, or else in other letter case, or else, if `others` is true,
-    /// with the extension of another image format.
+    /// The files that fit a name best: of the same name, or else in another Unicode normal form, or else in other
+    /// letter case, or else, if `others` is true, with the extension of another image format.
     fn of(&self, name: &str, others: bool) -> Vec<&OsString> {
         let all = self.files.get(&stem(name)).map_or(&[][..], Vec::as_slice);
         let fits = |test: &dyn Fn(&str) -> bool| -> Vec<&OsString> {
             all.iter().filter(|file| test(&file.to_string_lossy())).collect()
         };
         let is_image = |file: &str| others && extension(file).is_some();
-        let rules: [&dyn Fn(&str) -> bool; 3] =
-            [&|file| file == name, &|file| file.to_lowercase() == name.to_lowercase(), &is_image];
+        let rules: [&dyn Fn(&str) -> bool; 4] = [
+            &|file| file == name,
+            &|file| composed(file) == composed(name),
+            &|file| folded(file) == folded(name),
+            &is_image,
+        ];
         rules.into_iter().map(fits).find(|files| !files.is_empty()).unwrap_or_default()
     }
 }
@@ -257,14 +272,14 @@ fn words(part: &str) -> impl Iterator<Item = &str> {
 }
 
 fn lower(part: &str) -> String {
-    let part = part.to_lowercase();
+    let part = folded(part);
     match part.rsplit_once('_') {
         Some(("images", factor)) if factor.parse::<usize>().is_ok() => "images".to_owned(),
         _ => part,
     }
 }
 
-/// The parts of a path in lower case, without the factor of downscaled images.
+/// The folded parts of a path, without the factor of downscaled images.
 fn parts(path: &Path) -> Vec<String> {
     path.components()
         .filter_map(|part| match part {

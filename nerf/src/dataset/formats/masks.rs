@@ -1,5 +1,6 @@
 //! Masks in a folder beside the images.
 
+use super::paths::folded;
 use crate::dataset::capture::Capture;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -30,12 +31,12 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) {
     }
 }
 
-/// The files of each folder, by name in lower case.
+/// The files of each folder, by folded name.
 type Listings = HashMap<PathBuf, HashMap<String, PathBuf>>;
 
-/// The file of this path with its name in any case.
+/// The file of this path with its name in any case and Unicode normal form.
 fn in_any_case(listings: &mut Listings, path: &Path) -> Option<PathBuf> {
-    let lower = |path: &Path| Some(path.file_name()?.to_str()?.to_lowercase());
+    let lower = |path: &Path| Some(folded(path.file_name()?.to_str()?));
     let folder = path.parent()?;
     let listing = listings.entry(folder.to_owned()).or_insert_with(|| {
         let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
@@ -44,4 +45,23 @@ fn in_any_case(listings: &mut Listings, path: &Path) -> Option<PathBuf> {
         files.into_iter().filter_map(|path| Some((lower(&path)?, path))).collect()
     });
     listing.get(&lower(path)?).cloned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::formats::kit::{picture, picture_with_camera};
+
+    #[test]
+    fn mask_names_match_in_every_unicode_normal_form() {
+        for (name, mask) in [("Caf\u{e9}.jpg", "cafe\u{301}.png"), ("Cafe\u{301}.jpg", "Caf\u{e9}.jpg.png")] {
+            let folder = tempfile::tempdir().unwrap();
+            let mut capture = picture_with_camera(folder.path());
+            capture.views[0].name = name.into();
+            let mask = folder.path().join("masks").join(mask);
+            picture(&mask, 8, 6);
+            attach(&mut capture, &[folder.path().to_owned()]);
+            assert_eq!((capture.views[0].mask.as_ref(), capture.assumptions.len()), (Some(&mask), 0), "{name}");
+        }
+    }
 }

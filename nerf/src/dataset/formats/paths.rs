@@ -4,6 +4,7 @@ use super::json::Object;
 use crate::error::Result;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
+use unicode_normalization::UnicodeNormalization;
 
 /// Extensions of image files, tried in this order if a name has none.
 const EXTENSIONS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
@@ -28,6 +29,16 @@ pub(super) fn normal(object: &Object<'_>, name: &str, value: &Value) -> Result<S
         "" | "." => Err(object.error(name, "must be the path of a file, is empty")),
         rest => Ok(rest.to_owned()),
     }
+}
+
+/// A path in Unicode's composed form. macOS decomposes names: it stores `é` as two characters.
+pub(super) fn composed(path: &str) -> String {
+    path.nfc().collect()
+}
+
+/// A path for comparisons: in lower case and composed.
+pub(super) fn folded(path: &str) -> String {
+    composed(&path.to_lowercase())
 }
 
 /// The extension of a path if it is that of an image file.

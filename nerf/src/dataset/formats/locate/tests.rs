@@ -78,6 +78,33 @@ fn letter_case_and_extension_may_differ() {
 }
 
 #[test]
+fn unicode_normal_forms_may_differ() {
+    let [composed, decomposed] = ["Caf\u{e9}", "Cafe\u{301}"];
+    for (listed, stored) in [(composed, decomposed), (decomposed, composed)] {
+        let [file, name] = [stored, listed].map(|name| format!("images/{name}.jpg"));
+        finds(&[&file], &[&name], &[&file]);
+        let note = format!("`{name}` does not exist: used `{file}` (in another Unicode normal form)");
+        assert_eq!(found(&[&file], &[&name]).unwrap().1, [note]);
+        // Beside images that are there as listed, and with other letters or another extension.
+        finds(&[&file, "images/0.jpg"], &["images/0.jpg", &name], &["images/0.jpg", &file]);
+        finds(&[&file], &[&name.to_uppercase()], &[&file]);
+        finds(&[&file], &[&name.replace("jpg", "png")], &[&file]);
+        // A folder.
+        let [inside, place] = [stored, listed].map(|name| format!("{name}/0.jpg"));
+        finds(&[&inside, "other/0.jpg"], &[&place], &[&inside]);
+        // The name itself comes first, then the same letters in another form.
+        finds(&[&file, &name], &[&name], &[&name]);
+        finds(&[&file, &file.to_lowercase()], &[&name], &[&file]);
+        let upper = format!("images/{}.jpg", listed.to_uppercase());
+        let parts = ["does not exist", "(in another Unicode normal form) fit: correct the path"];
+        refuses(&[&file, &name], &[&upper], &parts);
+        assert!(found(&[&file], &[&file, &name]).unwrap().0[1].is_none(), "a file that another name lists");
+    }
+    // Other letters are other names.
+    finds(&["images/Cafe.jpg"], &["images/Caf\u{e9}.jpg"], &[""]);
+}
+
+#[test]
 fn ambiguous_files_are_refused() {
     refuses(
         &["a/0.png", "b/0.png"],
