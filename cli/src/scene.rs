@@ -82,13 +82,17 @@ impl Scene {
     /// Reads the capture of a folder, or builds that of a built-in scene without images, and prints what the reader
     /// assumed. `hold_out` replaces the splits; `description` is the file to read, below the folder.
     pub fn capture(&self, hold_out: Option<&HoldOut>, description: Option<&Path>) -> Result<Capture> {
-        let described = match (self, description) {
-            (Scene::Folder(folder), Some(file)) => Some((folder, folder.join(file))).filter(|(_, file)| file.is_file()),
-            _ => None,
-        };
-        let mut capture = match described {
-            Some((folder, file)) => Capture::read_description(folder, file)?,
-            None => builtin::capture(self, None, None)?,
+        let mut capture = match self {
+            Scene::Folder(folder) => {
+                let file = description.map(|file| folder.join(file)).filter(|file| file.is_file());
+                match file {
+                    // The splits of the files are not used.
+                    file if hold_out.is_some() => Capture::read_unsplit(folder, file.as_deref(), None)?,
+                    Some(file) => Capture::read_description(folder, file)?,
+                    None => Capture::read(folder)?,
+                }
+            }
+            built_in => builtin::capture(built_in, None, None)?,
         };
         assumptions(&capture);
         hold_out.map_or(Ok(()), |chosen| capture.hold_out(chosen))?;
@@ -101,7 +105,7 @@ impl Scene {
     /// For a built-in scene, or if the folder has no description in the format.
     pub fn description(&self, format: Format) -> Result<Option<PathBuf>> {
         match self {
-            Scene::Folder(folder) => Ok(inside(&Capture::read_format(folder, Some(format))?)),
+            Scene::Folder(folder) => Ok(inside(&Capture::read_unsplit(folder, None, Some(format))?)),
             _ => Err(Error::setting("format", "built-in scenes have no files: leave the flag out")),
         }
     }
@@ -261,6 +265,33 @@ mod tests {
     use super::*;
     use raygrad::nerf::Image;
     use serde_json::json;
+
+    #[test]
+    fn chosen_test_images_replace_wrong_splits() {
+        let folder = tempfile::tempdir().unwrap();
+        let frame = |i: usize| {
+            Image::new(8, 6, 3).save_png(folder.path().join(format!("{i}.png"))).unwrap();
+            let matrix = json!([[1, 0, 0, i], [0, 1, 0, i * i % 3], [0, 0, 1, 4], [0, 0, 0, 1]]);
+            json!({ "file_path": format!("{i}.png"), "transform_matrix": matrix })
+        };
+        let transforms = json!({
+            "fl_x": 9.0, "frames": (0..4).map(frame).collect::<Vec<_>>(),
+            "train_filenames": ["0.png", "1.png"], "test_filenames": ["1.png", "gone.png"]
+        });
+        std::fs::write(folder.path().join("transforms.json"), transforms.to_string()).unwrap();
+        let scene = Scene::Folder(folder.path().to_owned());
+        let message = scene.open(None, false, None, None).err().unwrap().to_string();
+        assert!(message.contains("has too: remove it from one of them, or choose the test images with `train --test`"));
+        let description = scene.description(Format::Transforms).unwrap();
+        for description in [None, description.as_deref()] {
+            let opened = scene.open(None, false, Some(&HoldOut::Every(2)), description).unwrap();
+            let names = |split| {
+                let frames = opened.load(split, 1, usize::MAX).unwrap().frames;
+                frames.into_iter().map(|frame| frame.name).collect::<Vec<_>>()
+            };
+            assert_eq!([names(Split::Train), names(Split::Test)], [["1.png", "3.png"], ["0.png", "2.png"]]);
+        }
+    }
 
     #[test]
     fn masks_as_alpha_are_loaded_as_an_object() {

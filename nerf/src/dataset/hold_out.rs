@@ -4,8 +4,13 @@ use super::capture::{Capture, View};
 use super::frames::Split;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use std::collections::HashSet;
 use std::fmt;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
+
+/// A remedy for wrong splits.
+pub(super) const CHOOSE: &str = "or choose the test images with `train --test`";
 
 /// The images that are held out as [test](Split::Test) images; all others are trained on.
 ///
@@ -73,38 +78,44 @@ impl FromStr for HoldOut {
 }
 
 impl Capture {
-    /// Replaces the splits of the files, or those that [`read`](Self::read) chose, by these held-out images.
+    /// Replaces the splits of the files, or those that [`read`](Self::read) chose, by these held-out images. Views of
+    /// one image are held out together.
     ///
     /// # Errors
-    /// If a name fits no image or several, or the file of a held-out image is also trained on.
+    /// If a name fits no image or several.
     pub fn hold_out(&mut self, chosen: &HoldOut) -> Result<()> {
-        let held_out: Vec<usize> = match chosen {
-            HoldOut::None => vec![],
+        let held_out: HashSet<PathBuf> = match chosen {
+            HoldOut::None => HashSet::new(),
             HoldOut::Every(count) => {
-                let mut by_name: Vec<usize> = (0..self.views.len()).collect();
-                by_name.sort_by_key(|&i| &self.views[i].name);
-                by_name.into_iter().step_by(*count).collect()
+                let mut by_name: Vec<&View> = self.views.iter().collect();
+                by_name.sort_by_key(|view| &view.name);
+                distinct(by_name).step_by(*count).map(|view| image(view).to_owned()).collect()
             }
-            HoldOut::Images(names) => names.iter().map(|name| self.named_view(name)).collect::<Result<_>>()?,
+            HoldOut::Images(names) => {
+                let image = |name: &String| Ok(image(self.named_view(name)?).to_owned());
+                names.iter().map(image).collect::<Result<_>>()?
+            }
         };
-        self.views.iter_mut().for_each(|view| view.split = Some(Split::Train));
-        held_out.into_iter().for_each(|i| self.views[i].split = Some(Split::Test));
-        self.check_splits()
+        for view in &mut self.views {
+            view.split = Some(if held_out.contains(image(view)) { Split::Test } else { Split::Train });
+        }
+        Ok(())
     }
 
-    /// The index of the view with a name: the whole name, or else an end of it, or else one without the extension.
-    fn named_view(&self, name: &str) -> Result<usize> {
+    /// The first view of the image with a name: the whole name, or else an end of it, or else one without the
+    /// extension.
+    fn named_view(&self, name: &str) -> Result<&View> {
         let is_end = |path: &str| path.strip_suffix(name).is_some_and(|rest| rest.is_empty() || rest.ends_with('/'));
         let is_stem = |path: &str| path.rsplit_once('.').is_some_and(|(stem, _)| is_end(stem));
         let rules: [&dyn Fn(&View) -> bool; 3] =
             [&|view| view.name == name, &|view| is_end(&view.name), &|view| is_stem(&view.name)];
-        let fitting = |rule: &dyn Fn(&View) -> bool| -> Vec<usize> {
-            (0..self.views.len()).filter(|&i| rule(&self.views[i])).collect()
+        let fitting = |rule: &dyn Fn(&View) -> bool| -> Vec<&View> {
+            distinct(self.views.iter().filter(|view| rule(view)).collect()).collect()
         };
         match rules.into_iter().map(fitting).find(|views| !views.is_empty()).unwrap_or_default()[..] {
             [one] => Ok(one),
             [one, two, ..] => {
-                let [one, two] = [one, two].map(|i| &self.views[i].name);
+                let [one, two] = [one, two].map(|view| &view.name);
                 Err(Error::setting(
                     "test",
                     format!("names `{name}`, which fits `{one}` and `{two}`: write more of the path"),
@@ -119,13 +130,23 @@ impl Capture {
     }
 }
 
+/// The file of a view's image or, if it is absent, its name.
+fn image(view: &View) -> &Path {
+    view.image.as_deref().unwrap_or(Path::new(&view.name))
+}
+
+/// The first view of each image.
+fn distinct(views: Vec<&View>) -> impl Iterator<Item = &View> {
+    let mut seen = HashSet::new();
+    views.into_iter().filter(move |view| seen.insert(image(view)))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::camera::pinhole::Camera;
     use crate::dataset::capture::Format;
     use glam::DAffine3;
-    use std::path::Path;
 
     fn capture(names: &[&str]) -> Capture {
         let camera = Camera::from_angle(8, 6, 0.9, DAffine3::IDENTITY);
@@ -179,11 +200,24 @@ mod tests {
             let message = held_out(&names, chosen).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");
         }
-        // One image under two names.
-        let mut twice = capture(&["a", "b"]);
-        twice.views[1].image = twice.views[0].image.clone();
-        let message = twice.hold_out(&HoldOut::Images(vec!["b".into()])).unwrap_err().to_string();
-        assert!(message.contains("`b` is held out, but its image is trained on as a"), "{message}");
+    }
+
+    #[test]
+    fn views_of_one_image_are_held_out_together() {
+        // One image under two names, and another in two files of frames.
+        let mut twice = capture(&["a", "c", "b", "c", "d"]);
+        twice.views[2].image = twice.views[0].image.clone();
+        for (chosen, expected) in [
+            ("b", [true, false, true, false, false]),
+            ("c", [false, true, false, true, false]),
+            ("every:2", [true, false, true, false, true]),
+            ("every:3", [true, false, true, false, false]),
+            ("none", [false; 5]),
+        ] {
+            twice.hold_out(&chosen.parse().unwrap()).unwrap();
+            let held_out = twice.views.iter().map(|view| view.split == Some(Split::Test));
+            assert_eq!(held_out.collect::<Vec<_>>(), expected, "{chosen}");
+        }
     }
 
     #[test]

@@ -4,6 +4,7 @@ use super::capture::{Capture, Format, View};
 use super::depth::{Depths, distances};
 use super::formats;
 use super::frames::{Dataset, Frame, Split, evenly_spaced};
+use super::hold_out::CHOOSE;
 use super::lens_mask::seen_pixels;
 use super::mask::Mask;
 use super::photo::{Header, Photo};
@@ -103,11 +104,7 @@ impl Capture {
     /// # Errors
     /// As [`read`](Self::read), or if there is no description in the format.
     pub fn read_format(path: impl AsRef<Path>, format: Option<Format>) -> Result<Capture> {
-        let path = path.as_ref();
-        if !path.exists() {
-            return Err(Error::file(path, "there is no such folder"));
-        }
-        formats::read(path, format)?.with_default_splits()
+        formats::read(path.as_ref(), format, true)?.with_default_splits()
     }
 
     /// Reads the capture of `folder` by a file that describes it, such as the [`file`](Self::file) of an earlier
@@ -116,7 +113,25 @@ impl Capture {
     /// # Errors
     /// As [`read`](Self::read), or if the file does not describe a capture.
     pub fn read_description(folder: impl AsRef<Path>, file: impl AsRef<Path>) -> Result<Capture> {
-        formats::read_file(folder.as_ref(), file.as_ref())?.with_default_splits()
+        formats::read_file(folder.as_ref(), file.as_ref(), true)?.with_default_splits()
+    }
+
+    /// Reads the capture of `folder` by the file `description` or, without one, as [`read_format`](Self::read_format)
+    /// does, but without splits. [`hold_out`](Self::hold_out) then makes them.
+    ///
+    /// # Errors
+    /// As [`read_format`](Self::read_format), but not if splits are wrong. Blender's files of held-out images are left
+    /// out if they are no JSON, as [`assumptions`](Self::assumptions) say.
+    pub fn read_unsplit(
+        folder: impl AsRef<Path>,
+        description: Option<&Path>,
+        format: Option<Format>,
+    ) -> Result<Capture> {
+        let folder = folder.as_ref();
+        let read = description.map(|file| formats::read_file(folder, file, false));
+        let mut capture = read.unwrap_or_else(|| formats::read(folder, format, false))?;
+        capture.views.iter_mut().for_each(|view| view.split = None);
+        Ok(capture)
     }
 
     fn with_default_splits(mut self) -> Result<Capture> {
@@ -154,13 +169,13 @@ impl Capture {
     }
 
     /// Checks that no held-out image is also trained on.
-    pub(super) fn check_splits(&self) -> Result<()> {
+    fn check_splits(&self) -> Result<()> {
         let train = self.present().filter(|view| view.split == Some(Split::Train));
         let trained: HashMap<&PathBuf, &View> = train.filter_map(|view| Some((view.image.as_ref()?, view))).collect();
         for view in self.present().filter(|view| view.split != Some(Split::Train)) {
             if let Some(other) = view.image.as_ref().and_then(|image| trained.get(image)) {
                 let what = format!(
-                    "`{}` is held out, but its image is trained on as {}: remove one of them",
+                    "`{}` is held out, but its image is trained on as {}: remove one of them, {CHOOSE}",
                     view.name, other.field
                 );
                 return Err(Error::field(&self.file, &view.field, what));

@@ -41,11 +41,21 @@ pub(super) fn file(folder: &Path) -> Option<PathBuf> {
 /// # Errors
 /// If there is no file, or one cannot be read, lacks a field, or has a field that is wrong or unsupported.
 pub fn read(folder: &Path) -> Result<Capture> {
-    let mut documents = vec![];
+    read_files(folder, true)
+}
+
+/// [`read`], without files of held-out images that are no JSON, unless they are `needed`.
+pub(super) fn read_files(folder: &Path, needed: bool) -> Result<Capture> {
+    let (mut documents, mut notes) = (vec![], vec![]);
     for split in Split::ALL {
         let file = file_of(folder, split);
-        if file.is_file() {
-            documents.push((split, json::read(&file)?, file));
+        if !file.is_file() {
+            continue;
+        }
+        match json::read(&file) {
+            Ok(document) => documents.push((split, document, file)),
+            Err(error) if needed || documents.is_empty() => return Err(error),
+            Err(error) => notes.push(format!("left out the frames of {error}")),
         }
     }
     let Some((_, _, first)) = documents.first() else {
@@ -54,7 +64,8 @@ pub fn read(folder: &Path) -> Result<Capture> {
         return Err(Error::file(folder, what));
     };
     let tops = documents.iter().map(|(_, document, file)| Object::top(file, document)).collect::<Result<Vec<_>>>()?;
-    let Frames { mut views, assumptions, .. } = Frames::read(&tops, folder, Dialect::Blender)?;
+    let Frames { mut views, mut assumptions, .. } = Frames::read(&tops, folder, Dialect::Blender)?;
+    assumptions.extend(notes);
     let mut aabb_scale = None;
     for (i, ((split, ..), views)) in documents.iter().zip(&mut views).enumerate() {
         views.iter_mut().for_each(|view| view.split = Some(*split));

@@ -52,12 +52,12 @@ impl Description {
         Some(Description::new(format, folder, file.to_owned()))
     }
 
-    /// Reads the capture.
-    fn read(&self) -> Result<Capture> {
+    /// Reads the capture; splits of its files must be right only if they are `needed`.
+    fn read(&self, needed: bool) -> Result<Capture> {
         let Description { format, folder, file } = self;
         match format {
-            Format::Blender => blender::read(folder),
-            Format::Transforms => transforms::read_file(folder, file),
+            Format::Blender => blender::read_files(folder, needed),
+            Format::Transforms => transforms::read_file(folder, file, needed),
             Format::Colmap => colmap::read_model(folder, file),
             Format::Llff => llff::read(folder),
         }
@@ -72,13 +72,13 @@ impl Description {
     }
 }
 
-/// Reads the capture of a folder that a file describes.
+/// Reads the capture of a folder that a file describes; its splits must be right only if they are `needed`.
 ///
 /// # Errors
 /// If the file is not a description, or as the format's own `read`.
-pub(in crate::dataset) fn read_file(folder: &Path, file: &Path) -> Result<Capture> {
+pub(in crate::dataset) fn read_file(folder: &Path, file: &Path, needed: bool) -> Result<Capture> {
     let description = Description::of_file(file).ok_or_else(|| Error::file(file, "does not describe a capture"))?;
-    Description { folder: folder.to_owned(), ..description }.read()
+    Description { folder: folder.to_owned(), ..description }.read(needed)
 }
 
 /// The descriptions in a folder: `transforms.json`, Blender, COLMAP's models, and LLFF. Earlier ones hold more, and are
@@ -100,13 +100,17 @@ fn descriptions(folder: &Path) -> Vec<Description> {
     out
 }
 
-/// Reads the capture in a folder, or that of a file that describes one. `asked` limits the formats.
+/// Reads the capture in a folder, or that of a file that describes one. `asked` limits the formats. Splits must be
+/// right only if they are `needed`.
 ///
 /// Of several descriptions, the one with most existing images counts; of equally many, the first.
 ///
 /// # Errors
 /// If there is no description, a description before the best cannot be read, or as the format's own `read`.
-pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>) -> Result<Capture> {
+pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool) -> Result<Capture> {
+    if !path.exists() {
+        return Err(Error::file(path, "there is no such folder"));
+    }
     if path.is_file() {
         let what = "does not describe a capture: name a folder, a .json file, poses_bounds.npy, or images.bin of a COLMAP \
                     model";
@@ -117,15 +121,15 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>) -> Result<Cap
                 format!("describes a capture in the format {}, not {asked}", description.format),
             ));
         }
-        return description.read();
+        return description.read(needed);
     }
     let mut all = descriptions(path);
     all.retain(|description| asked.is_none_or(|format| description.format == format));
     let Some(first) = all.first() else { return Err(unknown(path, asked)) };
     if all.len() == 1 {
-        return first.read();
+        return first.read(needed);
     }
-    let mut captures: Vec<(&Description, Result<Capture>)> = all.iter().map(|one| (one, one.read())).collect();
+    let mut captures: Vec<(&Description, Result<Capture>)> = all.iter().map(|one| (one, one.read(needed))).collect();
     let present = |capture: &Result<Capture>| capture.as_ref().map_or(0, |capture| capture.present().count());
     // The first of the best.
     let most = captures.iter().map(|(_, capture)| present(capture)).max().unwrap_or(0);

@@ -10,6 +10,7 @@ use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
 use crate::dataset::frames::Split;
+use crate::dataset::hold_out::CHOOSE;
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use glam::DAffine3;
@@ -37,17 +38,19 @@ pub(super) fn file(folder: &Path) -> PathBuf {
 /// If the file cannot be read, lacks a field, or has a field that is wrong or unsupported. If a mask or depth file is
 /// absent.
 pub fn read(folder: &Path) -> Result<Capture> {
-    read_file(folder, &file(folder))
+    read_file(folder, &file(folder), true)
 }
 
-/// [`read`] for a file of any name; its paths are relative to `folder`.
-pub(super) fn read_file(folder: &Path, file: &Path) -> Result<Capture> {
+/// [`read`] for a file of any name; its paths are relative to `folder`. Splits are read only if they are `needed`.
+pub(super) fn read_file(folder: &Path, file: &Path, needed: bool) -> Result<Capture> {
     let document = json::read(file)?;
     let top = Object::top(file, &document)?;
     let Frames { views, left_out, assumptions, .. } =
         Frames::read(std::slice::from_ref(&top), folder, Dialect::Transforms)?;
     let mut views: Vec<View> = views.into_iter().flatten().collect();
-    read_splits(&top, &mut views, &left_out)?;
+    if needed {
+        read_splits(&top, &mut views, &left_out)?;
+    }
     let scale = top.positive("applied_scale")?.unwrap_or(1.0);
     let transform = matrix::affine(&top, "applied_transform")?.unwrap_or(DAffine3::IDENTITY);
     // nerfstudio scales after the transform.
@@ -84,11 +87,13 @@ fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>)
                 if left_out.contains(&name) {
                     continue;
                 }
-                return Err(top.error(&field, format!("lists {name}, but no frame has this file_path")));
+                let what = format!("lists {name}, but no frame has this file_path: remove it, {CHOOSE}");
+                return Err(top.error(&field, what));
             };
             for &place in places {
                 if split != Split::Train && splits[place] == Some(Split::Train) {
-                    let what = format!("lists {name}, which train_filenames has too: remove it from one of them");
+                    let what =
+                        format!("lists {name}, which train_filenames has too: remove it from one of them, {CHOOSE}");
                     return Err(top.error(&field, what));
                 }
                 splits[place] = Some(split);

@@ -265,3 +265,31 @@ fn images_of_another_split_take_no_place() {
     std::fs::remove_dir_all(at("unlisted")).unwrap();
     assert!(read(folder.path()).unwrap().views.iter().all(|view| view.image.is_none()));
 }
+
+#[test]
+fn files_of_held_out_images_may_be_broken_if_their_splits_are_not_needed() {
+    use crate::dataset::HoldOut;
+    let folder = tempfile::tempdir().unwrap();
+    let document = json!({ "camera_angle_x": 0.8, "w": 8, "h": 6, "frames": frames(&["./a", "./b"]) });
+    std::fs::write(file_of(folder.path(), Split::Train), document.to_string()).unwrap();
+    let test = file_of(folder.path(), Split::Test);
+    picture(&folder.path().join("a.png"), 8, 6);
+    // The same image in two splits.
+    std::fs::write(&test, document.to_string()).unwrap();
+    let message = failure(Capture::read(folder.path()), "transforms_train.json");
+    says(&message, &["`a` is held out, but its image is trained on", "or choose the test images with `train --test`"]);
+    let mut capture = Capture::read_unsplit(folder.path(), None, None).unwrap();
+    assert!(capture.views.len() == 4 && capture.views.iter().all(|view| view.split.is_none()));
+    capture.hold_out(&HoldOut::Images(vec!["a".into()])).unwrap();
+    let splits: Vec<_> = capture.views.iter().map(|view| view.split.unwrap()).collect();
+    assert_eq!(splits, [Split::Test, Split::Train, Split::Test, Split::Train]);
+    std::fs::write(&test, "{").unwrap();
+    says(&failure(Capture::read(folder.path()), "transforms_test.json"), &["is not valid JSON"]);
+    let capture = Capture::read_unsplit(folder.path(), None, None).unwrap();
+    assert_eq!(capture.views.len(), 2);
+    assert!(matches!(&capture.assumptions[..], [note] if note.starts_with("left out the frames of ")
+        && note.contains("transforms_test.json: is not valid JSON")));
+    // Training images are needed.
+    std::fs::rename(&test, file_of(folder.path(), Split::Train)).unwrap();
+    says(&failure(Capture::read_unsplit(folder.path(), None, None), "transforms_train.json"), &["is not valid JSON"]);
+}

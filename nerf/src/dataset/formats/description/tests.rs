@@ -3,6 +3,10 @@ use super::*;
 use crate::dataset::capture::View;
 use crate::dataset::formats::colmap::Encoding;
 
+fn read(path: &Path, asked: Option<Format>) -> Result<Capture> {
+    super::read(path, asked, true)
+}
+
 /// Writes a capture of `total` images of which `present` exist, in a format; COLMAP's in the model `number`.
 fn write(folder: &Path, format: Format, [present, total]: [usize; 2], number: usize) {
     let capture = kit::picture_with_camera(folder);
