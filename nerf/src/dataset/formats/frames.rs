@@ -1,6 +1,6 @@
 //! The frames of a JSON file as views.
 
-use super::intrinsics::check_known;
+use super::intrinsics::{check_known, contradiction};
 use super::json::Object;
 use super::layers::Layers;
 use super::locate::{Located, locate};
@@ -91,7 +91,7 @@ impl Frames {
         let masks = files(&all, "mask_path", folder, taken, &mut self.assumptions)?;
         let depths = Depths::of(top, &all, (folder, taken), &mut self.assumptions)?;
         let first = frames.iter().zip(images).find_map(|(frame, (_, image))| Some((frame, image.as_ref()?)));
-        let (mut common, mut turned) = (None, BTreeSet::new());
+        let (mut common, mut turned, mut contradicting) = (None, BTreeSet::new(), None);
         let mut views = Vec::with_capacity(frames.len());
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
             check_known(frame)?;
@@ -116,7 +116,11 @@ impl Frames {
                     (None, None) => Ok([0, 0]),
                 }
             };
-            let camera = layers[i].camera(pose, header, dialect == Dialect::Transforms)?;
+            let angle_y = dialect == Dialect::Transforms;
+            let camera = layers[i].camera(pose, header, angle_y)?;
+            if contradicting.is_none() {
+                contradicting = [frame, top].into_iter().find_map(|object| contradiction(object, &camera, angle_y));
+            }
             views.push(View {
                 image: image.as_ref().map(|image| image.path.clone()),
                 mask: needed(frame, "mask_path", &masks[i], image.is_some())?,
@@ -125,6 +129,7 @@ impl Frames {
                 ..View::new(name, &frame.path, camera)
             });
         }
+        self.assumptions.extend(contradicting);
         if let Some(first) = turned.first() {
             let (count, first) = (turned.len(), first.strip_prefix(folder).unwrap_or(first).display());
             self.assumptions.push(format!(

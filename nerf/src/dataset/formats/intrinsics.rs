@@ -43,6 +43,9 @@ const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e9;
 const CENTRE: f64 = 1e9;
 const SIDE: f64 = 1048576.0;
 
+/// The relative difference of two focal lengths that is no rounding of a field of view.
+const DIFFERS: f64 = 0.01;
+
 /// The relative tolerance of a panorama's fields.
 const PANORAMA: f64 = 0.01;
 
@@ -196,13 +199,38 @@ fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Opt
             return Ok(None);
         }
         let Some(a) = object.number(angle)? else { return Ok(None) };
-        let f = 0.5 * side as f64 / (0.5 * a).tan();
+        let f = focal_length(side, a);
         if !(a > 0.0 && a < PI) || (side > 0 && !FOCAL.contains(&f)) {
             return Err(object.error(angle, format!("must be an angle in radians between 0 and pi, is {a}")));
         }
         Ok(Some(f))
     };
     Ok([axis("fl_x", "camera_angle_x", size[0])?, axis("fl_y", "camera_angle_y", size[1])?])
+}
+
+/// A note on a field of view that contradicts the focal length of the same object, which counts, as in other programs.
+/// Those of fisheye lenses have several conventions.
+pub(super) fn contradiction(object: &Object<'_>, camera: &Camera, angle_y: bool) -> Option<String> {
+    if !matches!(camera.lens, Lens::Pinhole | Lens::Brown { .. }) || camera.width == 0 {
+        return None;
+    }
+    let size = [camera.width, camera.height];
+    let given = focal_of(object, size, angle_y).ok()?;
+    ["camera_angle_x", "camera_angle_y"].into_iter().zip(given).zip(size).find_map(|((angle, focal), side)| {
+        let is_of_image = angle_y || angle == "camera_angle_x";
+        let (a, f) = (object.get(angle).and_then(number).filter(|_| is_of_image)?, focal?);
+        let own = 2.0 * (0.5 * side as f64 / f).atan();
+        let differs = (f - focal_length(side, a)).abs() > DIFFERS * f;
+        let field = object.field(angle);
+        let what =
+            format!("`{field}` is {a}, but the focal length of {f} pixels gives {own:.4}: used the focal length");
+        differs.then_some(what)
+    })
+}
+
+/// The focal length in pixels of a field of view across `side` pixels.
+fn focal_length(side: usize, angle: f64) -> f64 {
+    0.5 * side as f64 / (0.5 * angle).tan()
 }
 
 /// The focal lengths and the principal point of an object's intrinsic matrix, if it has one.

@@ -133,6 +133,11 @@ fn fields_of_other_programs_are_read() {
         "its sensor's"
     );
     assert_eq!(of(json!({ "fl_x": 9.0 })).focal, [9.0; 2]);
+    let sensor = good(|d| {
+        remove(d, "camera_angle_x");
+        (d["fl_x"], d["fl_y"], d["camera_angle_y"]) = (json!(9), json!(9), json!(0.4711));
+    });
+    assert_eq!(sensor.assumptions, [""; 0], "the sensor contradicts nothing");
     assert_eq!(of(json!({ "cx": 4.5 })).centre, [4.5, 3.0]);
     assert_ne!(of(json!({ "k1": 0.1 })).lens, plain.lens);
     assert_eq!(of(json!({ "k1": 0, "camera_model": "SIMPLE_RADIAL", "is_fisheye": 0 })), plain);

@@ -102,6 +102,43 @@ fn angles_replace_absent_focal_lengths() {
 }
 
 #[test]
+fn contradicting_angles_are_noted() {
+    let notes = |change: &dyn Fn(&mut Value)| {
+        let (folder, mut document) = (tempfile::tempdir().unwrap(), document());
+        change(&mut document);
+        std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+        transforms::read(folder.path()).unwrap().assumptions
+    };
+    let angle = |side: f64, f: f64| 2.0 * (0.5 * side / f).atan();
+    let [x, y] = [angle(64.0, 100.0), angle(48.0, 110.0)];
+    let note = |field: &str, given: f64, own: f64, f: f64| {
+        format!("`{field}` is {given}, but the focal length of {f} pixels gives {own:.4}: used the focal length")
+    };
+    // Equal up to rounding.
+    assert_eq!(notes(&|d| (d["camera_angle_x"], d["camera_angle_y"]) = (json!(x), json!(y))), [""; 0]);
+    assert_eq!(notes(&|d| d["camera_angle_x"] = json!((x * 100.0).round() / 100.0)), [""; 0]);
+    assert_eq!(notes(&|d| d["camera_angle_x"] = json!(0.8)), [note("camera_angle_x", 0.8, x, 100.0)]);
+    assert_eq!(notes(&|d| d["camera_angle_y"] = json!(0.8)), [note("camera_angle_y", 0.8, y, 110.0)]);
+    // In degrees.
+    assert_eq!(notes(&|d| d["camera_angle_x"] = json!(35.5)), [note("camera_angle_x", 35.5, x, 100.0)]);
+    // By a matrix, and in a frame.
+    let matrix = |d: &mut Value| {
+        ["fl_x", "fl_y", "cx", "cy"].iter().for_each(|name| remove(d, name));
+        d["K"] = json!([[100, 0, 31], [0, 110, 25], [0, 0, 1]]);
+        d["camera_angle_x"] = json!(0.7);
+    };
+    assert_eq!(notes(&matrix), [note("camera_angle_x", 0.7, x, 100.0)]);
+    let of_frame = |d: &mut Value| set(&mut d["frames"][1], &json!({ "fl_x": 50, "fl_y": 50, "camera_angle_x": x }));
+    assert_eq!(notes(&of_frame), [note("frames[1].camera_angle_x", x, angle(64.0, 50.0), 50.0)]);
+    // A value that is no number was never used.
+    assert_eq!(notes(&|d| d["camera_angle_x"] = json!("NaNa")), [""; 0]);
+    // Those of a frame take the place of the file's. A fisheye has other angles.
+    let angles = json!({ "camera_angle_x": 0.7, "camera_angle_y": 0.5 });
+    assert_eq!(notes(&|d| set(&mut d["frames"][1], &angles)), [""; 0]);
+    assert_eq!(notes(&|d| set(d, &json!({ "camera_angle_x": 0.7, "is_fisheye": true }))), [""; 0]);
+}
+
+#[test]
 fn all_lens_coefficients_are_read() {
     let brown = |k: [f64; 6], p: [f64; 2]| Lens::Brown { k, p };
     let fisheye = |k: [f64; 4], p: [f64; 2], s: [f64; 2]| Lens::Fisheye { k, p, s };
