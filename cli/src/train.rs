@@ -181,7 +181,7 @@ pub struct Args {
     /// total, counted from the start of the run.
     #[arg(long, help_heading = "Time", value_name = "RUN", conflicts_with_all = NEW)]
     resume: Option<PathBuf>,
-    /// How long MPI ranks wait for one another
+    /// Time to wait for an MPI rank
     ///
     /// After this time without a message from a rank, the run ends with its number. It must be longer than rank 0
     /// needs to render a preview and to save.

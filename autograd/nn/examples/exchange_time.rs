@@ -12,16 +12,23 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// Bytes that the relay passes on at a time.
-const CHUNK: usize = 1 << 14;
+const CHUNK: usize = 1 << 16;
+/// A lane that has been free for less than this was busy: the relay's thread woke up late.
+const LATE: Duration = Duration::from_micros(200);
 
 /// One direction of the link of a rank: when it is free.
 type Lane = Arc<Mutex<Instant>>;
 
-/// Takes bytes through a lane; returns when they are through.
-fn pass(lane: &Lane, earliest: Instant, bytes: usize, link: Link) -> Instant {
-    let mut free = lane.lock().unwrap();
-    *free = earliest.max(*free + Duration::from_secs_f64(bytes as f64 / link.bandwidth));
+/// Sends bytes that are here through a lane; returns when they are through.
+fn pass(lane: &Lane, bytes: usize, link: Link) -> Instant {
+    let (mut free, now) = (lane.lock().unwrap(), Instant::now());
+    let start = if now.saturating_duration_since(*free) < LATE { *free } else { now };
+    *free = start + Duration::from_secs_f64(bytes as f64 / link.bandwidth);
     *free
+}
+
+fn sleep_until(time: Instant) {
+    std::thread::sleep(time.saturating_duration_since(Instant::now()));
 }
 
 /// Passes bytes of one direction of a connection on, through the sender's and the receiver's lane.
@@ -29,7 +36,7 @@ fn relay(mut from: TcpStream, mut to: TcpStream, [out, into]: [Lane; 2], link: L
     let (sender, chunks) = channel::<(Instant, Vec<u8>)>();
     std::thread::spawn(move || {
         for (due, chunk) in chunks {
-            std::thread::sleep(due.saturating_duration_since(Instant::now()));
+            sleep_until(due);
             if to.write_all(&chunk).is_err() {
                 return;
             }
@@ -38,11 +45,13 @@ fn relay(mut from: TcpStream, mut to: TcpStream, [out, into]: [Lane; 2], link: L
     std::thread::spawn(move || {
         let mut chunk = vec![0; CHUNK];
         while let Ok(len @ 1..) = from.read(&mut chunk) {
-            let now = Instant::now();
-            // An idle lane begins now, and not when it became free.
-            let sent = pass(&out, now + Duration::from_secs_f64(len as f64 / link.bandwidth), len, link);
-            let due = pass(&into, sent + link.latency, len, link);
-            if sender.send((due, chunk[..len].to_vec())).is_err() {
+            sleep_until(pass(&out, len, link));
+            // The receiver takes bytes while they are sent, unless others send to it at the same time.
+            let mut free = into.lock().unwrap();
+            let due = Instant::now().max(*free + Duration::from_secs_f64(len as f64 / link.bandwidth));
+            *free = due;
+            drop(free);
+            if sender.send((due + link.latency, chunk[..len].to_vec())).is_err() {
                 return;
             }
         }
@@ -125,7 +134,7 @@ fn main() {
     );
     println!("|--:|--:|--:|--:|--:|--:|");
     for ranks in [2, 4] {
-        for megabits in [100.0, 1000.0, 2500.0] {
+        for megabits in [100.0, 300.0, 1000.0] {
             for delay in [0.1, 1.0, 10.0] {
                 let latency = Duration::from_secs_f64(1e-3 * delay);
                 let link = Link { latency, bandwidth: megabits * 1e6 / 8.0, loss: 0.0 };

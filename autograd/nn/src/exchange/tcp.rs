@@ -134,9 +134,11 @@ impl Exchange for Tcp {
 
     fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
         check_parts(parts, self.ranks());
-        for (peer, part) in self.peers.iter().zip(parts) {
-            let Some(peer) = peer else { continue };
-            let message = [&(part.len() as u64).to_le_bytes(), *part].concat();
+        // Ranks after this one come first, so that not all send to rank 0 at a time.
+        let (rank, ranks) = (self.rank, self.ranks());
+        for to in (rank + 1..rank + ranks).map(|to| to % ranks) {
+            let (Some(peer), part) = (&self.peers[to], parts[to]) else { continue };
+            let message = [&(part.len() as u64).to_le_bytes(), part].concat();
             self.sent += part.len() as u64;
             // A rank that has ended is found below.
             let _ = peer.outgoing.send(message);
