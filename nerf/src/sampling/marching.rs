@@ -7,7 +7,7 @@ use crate::dataset::Dataset;
 use crate::random::Jitter;
 use crate::range::check_range;
 use crate::space::occupancy::{
-    DensityFn, MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Skipping, Step, Threshold, Update,
+    DensityFn, MarchBuffer, OccupancyConfig, OccupancyGrid, Shares, Skip, Skipping, Step, Threshold, Update,
 };
 use crate::space::{silhouette, visibility};
 use crate::volume::quadrature::Quadrature;
@@ -244,6 +244,11 @@ impl<T: Scalar> Sampler<T> for Marching {
 
     /// Updates some cells from the field's densities.
     fn update(&mut self, progress: &Progress, densities: &DensityFn<'_>) -> bool {
+        let alone = &mut |own| Some(vec![own]);
+        Sampler::<T>::update_shared(self, progress, densities, &mut Shares { rank: 0, ranks: 1, gather: alone })
+    }
+
+    fn update_shared(&mut self, progress: &Progress, densities: &DensityFn<'_>, shares: &mut Shares<'_>) -> bool {
         let Progress { step, train_frac: fraction, seed } = *progress;
         self.progress = fraction;
         if step % GRID_EVERY != 1 || step == 1 || !self.config.occupancy.skip.grid {
@@ -251,7 +256,7 @@ impl<T: Scalar> Sampler<T> for Marching {
         }
         let plan = if step < WARM_UP { Update::ALL } else { Update::PARTIAL };
         // Counts updates instead of steps, so that every cell has its turn.
-        self.grid.update(&plan, seed, step / GRID_EVERY, densities);
+        self.grid.update_shared(&plan, seed, step / GRID_EVERY, densities, shares);
         let min_sigma = TRAINING_DEPTH / self.step();
         self.grid.threshold(&Threshold { min_sigma, or_mean: true, dilate: false });
         true

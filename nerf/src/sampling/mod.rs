@@ -17,7 +17,7 @@ use crate::component::{AnyConfig, ComponentType};
 use crate::dataset::Dataset;
 use crate::field::Field;
 use crate::random::Jitter;
-use crate::space::occupancy::{DensityFn, OccupancyGrid};
+use crate::space::occupancy::{DensityFn, OccupancyGrid, Shares};
 use crate::volume::quadrature::Quadrature;
 use crate::volume::query::Query;
 use crate::volume::render::{Evaluations, Rendered};
@@ -167,6 +167,12 @@ pub trait Sampler<T: Scalar>: Any + Send + Sync {
     /// Updates from the field's densities before a training step; returns whether the [grid](Self::grid) changed.
     fn update(&mut self, _progress: &Progress, _densities: &DensityFn<'_>) -> bool {
         false
+    }
+
+    /// As [`update`](Self::update), with the evaluations shared between processes if the sampler can. Afterwards the
+    /// sampler must be the same in all of them.
+    fn update_shared(&mut self, progress: &Progress, densities: &DensityFn<'_>, _shares: &mut Shares<'_>) -> bool {
+        self.update(progress, densities)
     }
 
     /// Updates from a trained field before it is rendered.

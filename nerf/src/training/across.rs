@@ -3,6 +3,7 @@
 use crate::dataset::Dataset;
 use crate::model::Model;
 use crate::{Error, Result};
+use raygrad_autograd::Scalar;
 use raygrad_nn::{Exchange, ExchangeError};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -105,6 +106,19 @@ impl Across {
         });
         starts.map_err(|error| Error::setting("exchange", error))?;
         Ok(Across { exchange, error: None, stops: false })
+    }
+
+    /// The numbers of all ranks, by rank. `None` after an error.
+    pub fn gather(&mut self, own: &[f32]) -> Option<Vec<Vec<f32>>> {
+        let mut bytes = vec![];
+        f32::write_le(own, &mut bytes);
+        match self.exchange.all_gather(&bytes) {
+            Ok(all) => Some(all.iter().map(|bytes| f32::read_le(bytes)).collect()),
+            Err(error) => {
+                self.error = Some(error);
+                None
+            }
+        }
     }
 
     /// Begins a step: returns the training time by the clock of rank 0, or `None` at the end of the run.

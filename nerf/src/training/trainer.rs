@@ -14,6 +14,7 @@ use crate::model::config::Config;
 use crate::model::{Model, POSES, SceneBox, densities};
 use crate::random::{Jitter, stream};
 use crate::sampling::{BatchSize, Progress};
+use crate::space::occupancy::Shares;
 use crate::{Error, Result};
 use raygrad_autograd::{Error as GraphError, Pool, Tape, Var};
 use raygrad_nn::{Bound, Exchange, ExchangeError, SLOTS, Tiles};
@@ -262,6 +263,9 @@ impl Trainer {
         }
         // After a restart, steps of the new model count.
         self.update_sampler(&Progress { step: self.groups.steps() + 1, train_frac: fraction, seed: self.seed() });
+        if self.exchange_error().is_some() {
+            return self.done;
+        }
         let (mut tiles, mut across) = (std::mem::take(&mut self.tiles), self.across.take());
         let draw = self.draw(fraction);
         let number = draw.number;
@@ -411,7 +415,16 @@ impl Trainer {
     fn update_sampler(&mut self, progress: &Progress) {
         let Model { sampler, field, params, .. } = &mut self.model;
         let pool = &self.pool;
-        if sampler.update(progress, &|points, out| densities(&**field, params, pool, points, out)) {
+        let density = |points: &[[f32; 3]], out: &mut [f32]| densities(&**field, params, pool, points, out);
+        let has_changed = match &mut self.across {
+            None => sampler.update(progress, &density),
+            Some(across) => {
+                let (rank, ranks) = (across.exchange.rank(), across.exchange.ranks());
+                let gather = &mut |own: Vec<f32>| across.gather(&own);
+                sampler.update_shared(progress, &density, &mut Shares { rank, ranks, gather })
+            }
+        };
+        if has_changed {
             self.count_occupied();
         }
     }

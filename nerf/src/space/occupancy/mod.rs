@@ -65,7 +65,7 @@ use std::sync::Arc;
 
 pub use march::{MAX_STEPS, MarchBuffer, Step};
 pub use skip::{Skip, Skipping};
-pub use update::{DensityFn, POINTS, Update};
+pub use update::{DensityFn, POINTS, Shares, Update};
 
 /// The most cells of a grid.
 const MOST_CELLS: usize = 1 << 30;

@@ -23,6 +23,18 @@ const REBUILD: usize = 2;
 /// Samples along each edge of a cell that [`OccupancyGrid::prune`] would empty.
 const CLOSELY: usize = 4;
 
+/// The processes that share the [update](OccupancyGrid::update_shared) of a grid. All have the same grid.
+pub struct Shares<'a> {
+    /// The number of this process, from 0.
+    pub rank: usize,
+    /// Number of processes.
+    pub ranks: usize,
+    /// Sends numbers to all processes, and returns those of each, by rank. `None` if that fails: the grid is then
+    /// updated in part.
+    #[allow(clippy::type_complexity)]
+    pub gather: &'a mut dyn FnMut(Vec<f32>) -> Option<Vec<Vec<f32>>>,
+}
+
 /// The cells that [`OccupancyGrid::update`] samples, and how.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -127,6 +139,23 @@ impl OccupancyGrid {
     /// # Panics
     /// If a value of `plan` is out of range.
     pub fn update(&mut self, plan: &Update, seed: u64, step: u64, density: &DensityFn<'_>) -> u64 {
+        let alone = &mut |own| Some(vec![own]);
+        self.update_shared(plan, seed, step, density, &mut Shares { rank: 0, ranks: 1, gather: alone })
+    }
+
+    /// As [`update`](Self::update), with the evaluations shared between processes. The grid gets the same bits for any
+    /// number of them. Returns the number of evaluations of this process.
+    ///
+    /// # Panics
+    /// As [`update`](Self::update).
+    pub fn update_shared(
+        &mut self,
+        plan: &Update,
+        seed: u64,
+        step: u64,
+        density: &DensityFn<'_>,
+        shares: &mut Shares<'_>,
+    ) -> u64 {
         assert!(plan.every > 0 && plan.occupied_every > 0, "`every` and `occupied_every` must be at least 1: {plan:?}");
         assert!((1..=4).contains(&plan.samples), "`samples` must be 1 to 4: {plan:?}");
         assert!((0.0..=1.0).contains(&plan.decay), "`decay` must be 0 to 1: {plan:?}");
@@ -135,9 +164,30 @@ impl OccupancyGrid {
         let rng = |task: usize| stream(seed, [step, task as u64]);
         // A NaN of the field replaces the known density.
         let keep = |old: f32, new: f32| if new <= plan.decay * old { plan.decay * old } else { new };
-        let count = self.look(&Places::random(plan.samples as usize), chosen, rng, keep, density);
+        // Neighbouring tasks have similar numbers of occupied cells.
+        let (rank, ranks) = (shares.rank, shares.ranks);
+        let own = |word: usize| if word / TASK % ranks == rank { chosen(word) } else { 0 };
+        let count = self.look(&Places::random(plan.samples as usize), own, rng, keep, density);
+        if ranks > 1 {
+            self.gather(chosen, shares);
+        }
         self.words = words;
         count
+    }
+
+    /// Takes the densities of the chosen cells from the processes that have sampled them.
+    fn gather(&mut self, chosen: impl Fn(usize) -> u64, shares: &mut Shares<'_>) {
+        let (lattice, densities) = (&self.lattice, Arc::make_mut(&mut self.densities));
+        let mut of_ranks = vec![vec![]; shares.ranks];
+        for (word, densities) in densities.chunks_exact(CELLS).enumerate() {
+            let cells = cells(lattice, word, densities, &chosen);
+            of_ranks[word / TASK % shares.ranks].extend(bits_of(cells).map(|bit| word * CELLS + bit));
+        }
+        let own = of_ranks[shares.rank].iter().map(|&cell| densities[cell]).collect();
+        let Some(found) = (shares.gather)(own) else { return };
+        for (cells, found) in of_ranks.iter().zip(found) {
+            cells.iter().zip(found).for_each(|(&cell, found)| densities[cell] = found);
+        }
     }
 
     /// Finds the occupied cells of a trained field anew, for rendering, and returns the number of density evaluations.
@@ -222,6 +272,23 @@ impl OccupancyGrid {
     }
 }
 
+/// The chosen cells of a word, whose densities are `densities`, that can be occupied.
+fn cells(lattice: &Lattice, word: usize, densities: &[f32], chosen: impl Fn(usize) -> u64) -> u64 {
+    match if lattice.is_used(word) { chosen(word) } else { 0 } {
+        0 => 0,
+        cells => cells & uncarved(densities),
+    }
+}
+
+/// The numbers of the bits that are set, in order.
+fn bits_of(mut word: u64) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let bit = (word != 0).then(|| word.trailing_zeros() as usize)?;
+        word &= word - 1;
+        Some(bit)
+    })
+}
+
 /// The sum of `f` over the parts, in parallel, with scratch space.
 fn counted<P: Send, S: Default + Send>(
     parts: impl Iterator<Item = P>,
@@ -259,15 +326,10 @@ impl Look<'_> {
         let scale = |word: usize| lattice.enlargement(task * TASK + word);
         let mut count = 0;
         for word in 0..densities.len() / CELLS {
-            let mut cells = if lattice.is_used(task * TASK + word) { chosen(task * TASK + word) } else { 0 };
-            if cells != 0 {
-                cells &= uncarved(&densities[word * CELLS..(word + 1) * CELLS]);
-            }
+            let cells = cells(lattice, task * TASK + word, &densities[word * CELLS..(word + 1) * CELLS], &chosen);
             let [corner, size] = lattice.block(task * TASK + word).map(|x| x.to_array());
             count += samples * cells.count_ones() as usize;
-            while cells != 0 {
-                let bit = cells.trailing_zeros() as usize;
-                cells &= cells - 1;
+            for bit in bits_of(cells) {
                 if waiting.points.len() + samples > POINTS {
                     waiting.flush(density, samples, densities, scale, &keep);
                 }
