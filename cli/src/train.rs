@@ -422,6 +422,8 @@ fn train(
     listener: Option<Listener>,
 ) -> Result<Trained> {
     share(&mut trainer, &run, budget)?;
+    let sent = |trainer: &mut Trainer| trainer.exchange_mut().map(|exchange| exchange.sent_bytes());
+    let before = (trainer.stats().step, sent(&mut trainer));
     let mut window = listener.map(|listener| TrainingViewer::open(listener, &run, &trainer)).transpose()?;
     let mut watch = Watch::new((&run, lock), &trainer, budget, args.checkpoint_every, preview, args.tensorboard)?;
     interrupt::listen();
@@ -468,6 +470,10 @@ fn train(
     // The lock is released here, so that another program may resume the run.
     watch.finish(&trainer, ended, good)?;
     summarise(&run, &trainer.stats(), ended == Ended::Interrupted)?;
+    if let (first, Some(before), Some(after)) = (before.0, before.1, sent(&mut trainer)) {
+        let each = (after - before) as f64 / (trainer.stats().step.saturating_sub(first)).max(1) as f64;
+        print(&format!("sent     {:.0} kB by rank 0 in each step\n", 1e-3 * each))?;
+    }
     if let Some(reason) = &diverged {
         let schedule = trainer.model.config.schedule;
         let rate = if let Schedule::Constant { .. } = schedule { "lr" } else { "from" };
