@@ -44,6 +44,7 @@ pub(crate) mod distortion;
 pub(crate) mod early_termination;
 pub mod quadrature;
 pub(crate) mod query;
+pub(crate) mod regions;
 pub(crate) mod render;
 pub(crate) mod rounds;
 #[cfg(test)]
@@ -55,5 +56,6 @@ pub use depth::OpticalDepth;
 pub use distortion::Distortion;
 pub use early_termination::VisibleSamples;
 pub use query::{Query, RayVars};
+pub use regions::{Region, composite};
 pub use render::{Evaluations, RayWeights, Rendered, accumulate, weights};
 pub use weights::Weights;
