@@ -97,10 +97,13 @@ enum Command {
 fn main() -> ExitCode {
     let code = match run(Cli::parse()) {
         Ok(code) => code,
-        Err(Stop::Interrupted) => interrupt::EXIT_CODE.into(),
+        Err(Stop::Interrupted) => {
+            ranks::fail(interrupt::EXIT_CODE);
+            interrupt::EXIT_CODE.into()
+        }
         Err(Stop::Failed(error)) => {
             complain_of(&error);
-            ranks::fail();
+            ranks::fail(1);
             ExitCode::FAILURE
         }
     };
@@ -110,10 +113,14 @@ fn main() -> ExitCode {
 
 fn run(cli: Cli) -> Work<ExitCode> {
     simd::check_environment().map_err(|what| Error::setting("environment", what))?;
-    match &cli.command {
-        Some(Command::Train(args)) => ranks::start(Some(args.rank_timeout), cli.threads.is_some())?,
-        None | Some(Command::Render(_) | Command::Eval(_)) => ranks::start(None, cli.threads.is_some())?,
-        _ => ranks::refuse()?,
+    let is_shared = match &cli.command {
+        None | Some(Command::Train(_)) => true,
+        Some(Command::Render(args)) => args.shard.is_none(),
+        Some(Command::Eval(args)) => args.shard.is_none(),
+        _ => false,
+    };
+    if is_shared {
+        ranks::start(cli.threads.is_some())?;
     }
     if let Some(threads) = cli.threads {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
@@ -145,7 +152,11 @@ fn run(cli: Cli) -> Work<ExitCode> {
 
 /// What the bare program does: trains, and renders an image if training came to its end.
 fn first_run(args: &train::Args) -> Work<ExitCode> {
-    end_first_run(&train::run(args)?, |folder| render::run(&render::Args::picture(folder)))
+    let trained = train::run(args)?;
+    if ranks::is_silent() {
+        return Ok(trained.exit_code());
+    }
+    end_first_run(&trained, |folder| render::run(&render::Args::picture(folder)))
 }
 
 /// Renders if training came to its end, and prints what can be done with the run unless it diverged.

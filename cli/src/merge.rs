@@ -1,6 +1,7 @@
 //! `raygrad merge`: makes the result of complete shards.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use raygrad::nerf::Error;
 
@@ -49,6 +50,9 @@ pub fn merge_if_complete(at: &Path, shard: Shard) -> Work<()> {
     if !ranks::wait()? {
         return Ok(());
     }
+    if ranks::own().is_some() {
+        return merge_ranks(at);
+    }
     let rest = match shard::progress(at)? {
         Progress::Complete(complete) => return merge(*complete),
         Progress::None => "another raygrad has merged the shards".into(),
@@ -56,6 +60,22 @@ pub fn merge_if_complete(at: &Path, shard: Shard) -> Work<()> {
         Progress::Incomplete(missing) => format!("still missing {missing}"),
     };
     Ok(print(&format!("shard    {shard} is complete; {rest}\n"))?)
+}
+
+/// Merges the shards of ranks, all of which are complete. On a network file system, some may show a little later.
+fn merge_ranks(at: &Path) -> Work<()> {
+    for _ in 0..20 {
+        match shard::progress(at)? {
+            Progress::Complete(complete) => return merge(*complete),
+            Progress::Merging => break,
+            Progress::None | Progress::Incomplete(_) => std::thread::sleep(Duration::from_millis(500)),
+        }
+    }
+    let what = format!(
+        "does not show the results of all ranks: use a file system that all share, or run `raygrad merge {}` later",
+        at.display()
+    );
+    Err(Error::file(at, what).into())
 }
 
 fn merge(complete: Complete) -> Work<()> {

@@ -3,6 +3,7 @@
 //! Rank 0 alone prints and writes. Training exchanges gradients; frames and views are shared as shards.
 
 use std::cell::RefCell;
+use std::process::Command;
 use std::sync::OnceLock;
 use std::time::Duration;
 
@@ -15,9 +16,11 @@ use super::shard::Shard;
 
 /// Variables in which launchers tell the number of processes: Open MPI, MPICH and Intel MPI, MVAPICH.
 const COUNTS: [&str; 3] = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE"];
-/// How long ranks wait for one another at the end of work that is not shared evenly.
-#[cfg(feature = "mpi")]
-const PATIENCE: Duration = Duration::from_secs(7 * 24 * 3600);
+/// How long ranks wait for one another before training, while rank 0 may prepare a video, and after renders.
+pub const PATIENCE: Duration = Duration::from_secs(7 * 24 * 3600);
+
+/// The rank in a job of `srun --mpi=pmix`.
+const RANK: &str = "PMIX_RANK";
 
 /// Rank and number of ranks; unset in a single process.
 static OWN: OnceLock<(usize, usize)> = OnceLock::new();
@@ -31,33 +34,24 @@ thread_local! {
 fn launched(variable: impl Fn(&str) -> Option<String>) -> usize {
     let counted = COUNTS.iter().find_map(|name| variable(name)?.parse().ok());
     // `srun --mpi=pmix` tells the number by Slurm's own variable only.
-    let slurm = || variable("PMIX_RANK").and(variable("SLURM_STEP_NUM_TASKS"))?.parse().ok();
+    let slurm = || variable(RANK).and(variable("SLURM_STEP_NUM_TASKS"))?.parse().ok();
     counted.or_else(slurm).unwrap_or(1)
 }
 
-/// Connects the processes of a job; does nothing in a single process. `timeout` is how long ranks that train wait for
-/// one another, and `threads` whether the number of threads is given.
-pub fn start(timeout: Option<Duration>, threads: bool) -> Result<(), Error> {
+/// Connects the processes of a job; does nothing in a single process. `threads` is whether the number of threads is
+/// given.
+pub fn start(threads: bool) -> Result<(), Error> {
     let count = launched(|name| std::env::var(name).ok());
-    if count > 1 { connect(count, timeout, threads) } else { Ok(()) }
+    if count > 1 { connect(count, threads) } else { Ok(()) }
 }
 
-/// Fails if several processes were started together. For commands that do not share their work.
-pub fn refuse() -> Result<(), Error> {
-    match launched(|name| std::env::var(name).ok()) {
-        1 => Ok(()),
-        count => {
-            let what = format!(
-                "{count} processes were started together, but this command needs one; only train, render and \
-                                eval share their work"
-            );
-            Err(Error::setting("mpi", what))
-        }
-    }
+/// Makes a program that this one starts a single process.
+pub fn leave(command: &mut Command) {
+    COUNTS.iter().chain(&[RANK]).for_each(|name| _ = command.env_remove(name));
 }
 
 #[cfg(not(feature = "mpi"))]
-fn connect(count: usize, _: Option<Duration>, _: bool) -> Result<(), Error> {
+fn connect(count: usize, _: bool) -> Result<(), Error> {
     let what = format!(
         "{count} processes were started together, but this raygrad is built without MPI: build it with `cargo install \
          --path cli --features mpi`, or start one process"
@@ -66,8 +60,9 @@ fn connect(count: usize, _: Option<Duration>, _: bool) -> Result<(), Error> {
 }
 
 #[cfg(feature = "mpi")]
-fn connect(_: usize, timeout: Option<Duration>, threads: bool) -> Result<(), Error> {
-    let mut mpi = raygrad::nn::Mpi::initialize(timeout.unwrap_or(PATIENCE)).map_err(failed)?;
+fn connect(_: usize, threads: bool) -> Result<(), Error> {
+    let mut mpi = raygrad::nn::Mpi::initialize(PATIENCE).map_err(failed)?;
+    let _ = OWN.set((mpi.rank(), mpi.ranks()));
     let place = place();
     let places = mpi.all_gather(place.as_bytes()).map_err(failed)?;
     if !threads && std::env::var_os("RAYON_NUM_THREADS").is_none() {
@@ -76,7 +71,6 @@ fn connect(_: usize, timeout: Option<Duration>, threads: bool) -> Result<(), Err
         let pool = rayon::ThreadPoolBuilder::new().num_threads((cores / sharing).max(1)).build_global();
         pool.map_err(|e| Error::setting("threads", e))?;
     }
-    let _ = OWN.set((mpi.rank(), mpi.ranks()));
     EXCHANGE.set(Some(Box::new(mpi)));
     Ok(())
 }
@@ -153,12 +147,13 @@ pub fn finish() {
     raygrad::nn::Mpi::finalize();
 }
 
-/// Ends all ranks of a job of which this one has failed, since the others would wait for it.
-pub fn fail() {
+/// Ends all ranks of a job of which this one ends early, since the others would wait for it.
+pub fn fail(code: u8) {
     #[cfg(feature = "mpi")]
     if own().is_some() {
-        raygrad::nn::Mpi::abort(1);
+        raygrad::nn::Mpi::abort(code.into());
     }
+    let _ = code;
 }
 
 #[cfg(test)]

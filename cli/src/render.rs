@@ -97,7 +97,7 @@ pub struct Args {
     /// For several programs, such as a job array, that write to one folder. Give each the same command with another
     /// I of I/N. The last one to finish makes the video. See `raygrad merge`.
     #[arg(long, help_heading = "Output", value_name = "I/N")]
-    shard: Option<Shard>,
+    pub shard: Option<Shard>,
     /// Keep a video's frames in FILE.frames/
     #[arg(long, help_heading = "Output")]
     keep_frames: bool,
@@ -180,6 +180,9 @@ pub fn run(args: &Args) -> Work<()> {
     let run = Run::open(&args.run)?;
     let out = args.out.clone().unwrap_or_else(|| run.file(args.flight.path.name()));
     let kind = args.kind(&out)?;
+    if kind == Kind::Png && ranks::is_silent() {
+        return Ok(());
+    }
     let arguments = args.arguments(&run);
     // Without --out, renders go to a folder of the run, which no one else writes to.
     let job = Job::new(COMMAND, &arguments, args.overwrite || args.out.is_none());
@@ -202,7 +205,6 @@ pub fn run(args: &Args) -> Work<()> {
     let renderer = Renderer::new(model, args.precision)?;
     let shown = Shown { renderer: &renderer, extent, background, show, save: &args.save, depth_unit };
     let folder = match kind {
-        Kind::Png if ranks::is_silent() => return Ok(()),
         Kind::Png => {
             check_writable(parent(&out))?;
             let picture = shown.frame(&cameras[0]).image.to_png();

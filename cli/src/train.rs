@@ -184,9 +184,9 @@ pub struct Args {
     /// Time to wait for an MPI rank
     ///
     /// After this time without a message from a rank, the run ends with its number. It must be longer than rank 0
-    /// needs to render a preview and to save.
+    /// needs to render a preview and to save. With --view, which can pause, ranks wait without limit.
     #[arg(long, help_heading = "Time", value_name = "TIME", value_parser = parse::duration, default_value = "10m")]
-    pub rank_timeout: Duration,
+    rank_timeout: Duration,
     /// Time between checkpoints
     ///
     /// Measured in training time. --resume continues from the last checkpoint.
@@ -261,13 +261,13 @@ impl Trained {
 
 /// Trains a new run or resumes one.
 pub fn run(args: &Args) -> Work<Trained> {
+    if ranks::is_silent() {
+        return follow();
+    }
     if !args.view && args.place.are_given() {
         return Err(Error::setting("view", "is missing: --host and --port need --view").into());
     }
     // Binds the port first, before files are created.
-    if ranks::is_silent() {
-        return follow();
-    }
     let listener = args.view.then(|| args.place.listen()).transpose()?;
     match &args.resume {
         None => begin(args, listener),
@@ -323,27 +323,38 @@ struct Shared {
     folder: PathBuf,
     config: RunConfig,
     budget: Budget,
+    /// How long ranks wait for one another in training.
+    timeout: Duration,
 }
 
 /// Shares the training of a run with the other ranks, if there are any.
-fn share(trainer: &mut Trainer, run: &Run, budget: Budget) -> Result<()> {
+fn share(trainer: &mut Trainer, run: &Run, budget: Budget, timeout: Duration) -> Result<()> {
     let Some(mut exchange) = ranks::take() else { return Ok(()) };
-    let shared = Shared { folder: run.folder.clone(), config: run.config.clone(), budget };
+    let shared = Shared { folder: run.folder.clone(), config: run.config.clone(), budget, timeout };
     ranks::of_first(&mut *exchange, Some(&shared))?;
     ranks::bytes_of_first(&mut *exchange, &trainer.state()?)?;
     print(&format!("ranks    {}, connected by MPI\n", exchange.ranks()))?;
-    trainer.share(exchange)
+    trainer.share(exchange)?;
+    set_timeout(trainer, timeout);
+    Ok(())
+}
+
+fn set_timeout(trainer: &mut Trainer, timeout: Duration) {
+    if let Some(exchange) = trainer.exchange_mut() {
+        exchange.set_timeout(timeout);
+    }
 }
 
 /// Trains the run of rank 0. It writes nothing.
 fn follow() -> Work<Trained> {
     let lost = || Error::setting("mpi", "this rank has no connection to the others");
     let mut exchange = ranks::take().ok_or_else(lost)?;
-    let Shared { folder, config, budget } = ranks::of_first(&mut *exchange, None)?;
+    let Shared { folder, config, budget, timeout } = ranks::of_first(&mut *exchange, None)?;
     let state = ranks::bytes_of_first(&mut *exchange, &[])?;
     let (_, _, mut trainer) = reopen(&Run { folder: folder.clone(), config })?;
     trainer.load_state(&state)?;
     trainer.share(exchange)?;
+    set_timeout(&mut trainer, timeout);
     interrupt::listen();
     loop {
         trainer
@@ -421,7 +432,9 @@ fn train(
     preview: Preview,
     listener: Option<Listener>,
 ) -> Result<Trained> {
-    share(&mut trainer, &run, budget)?;
+    // A page can pause the training for as long as it likes.
+    let timeout = if args.view { ranks::PATIENCE } else { args.rank_timeout };
+    share(&mut trainer, &run, budget, timeout)?;
     let sent = |trainer: &mut Trainer| trainer.exchange_mut().map(|exchange| exchange.sent_bytes());
     let before = (trainer.stats().step, sent(&mut trainer));
     let mut window = listener.map(|listener| TrainingViewer::open(listener, &run, &trainer)).transpose()?;
@@ -448,6 +461,9 @@ fn train(
                 return Err(Error::setting("mpi", what));
             }
         };
+        if interrupted && !interrupt::requested() {
+            watch.stop(&trainer);
+        }
         let reason = (trainer.stats().ends_diverged() && !watch.has_lost_its_run()).then(|| watch::reason(&trainer));
         let tries_again = trainer.stats().has_diverged() && retreats < RETREATS && !interrupted && !ended_by_page;
         let again = reason.as_ref().is_some_and(|reason| tries_again && watch.retreat(&mut trainer, reason));

@@ -176,6 +176,13 @@ impl<'a> Watch<'a> {
         }
     }
 
+    /// Writes a checkpoint of a run that another rank has stopped after its last step.
+    pub fn stop(&mut self, trainer: &Trainer) {
+        if !trainer.stats().ends_diverged() {
+            self.attempt(|watch| watch.save(trainer, false));
+        }
+    }
+
     /// Writes a checkpoint and the summary. With `model`, writes the model before them.
     fn save(&mut self, trainer: &Trainer, model: bool) -> Result<()> {
         self.keep()?;

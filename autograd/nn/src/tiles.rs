@@ -173,7 +173,11 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
         let own = slots_of(rank, ranks);
         let mut results = self.run(params, count, own.clone(), &loss);
         self.add_pairs(|pair| own.start <= pair.start && pair.end <= own.end);
-        let message = self.message(params, count, own, &results)?;
+        let message = self.message(params, count, own, &results).or_else(|error| {
+            // The others must not wait for it.
+            exchange.all_gather(&[])?;
+            Err(error)
+        })?;
         for (other, message) in exchange.all_gather(&message)?.iter().enumerate().filter(|(other, _)| *other != rank) {
             self.receive(params, count, slots_of(other, ranks), &mut Reader(message), &mut results)
                 .map_err(|what| ExchangeError::Differs { rank: other, what })?;
@@ -270,9 +274,11 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
         frame.number(count);
         frame.number(params.trainable().count());
         for slot in slots {
-            let results = postcard::to_allocvec(&results[slot])
-                .map_err(|error| ExchangeError::Connection(format!("a tile's result cannot be sent: {error}")))?;
-            frame.bytes(&results);
+            for result in &results[slot] {
+                let result = postcard::to_allocvec(result)
+                    .map_err(|error| ExchangeError::Connection(format!("a tile's result cannot be sent: {error}")))?;
+                frame.bytes(&result);
+            }
             let Slot { sums, shares } = &self.slots[slot];
             for ((sum, shares), id) in sums.iter().zip(shares).zip(params.trainable()) {
                 match sum {
@@ -308,23 +314,23 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
         results: &mut [Vec<R>],
     ) -> Result<(), String> {
         let damaged = || "has sent a message that cannot be read; start all ranks with the same program".to_owned();
-        let [tiles, trainable] = [(); 2].map(|()| reader.number());
-        let own = [count, params.trainable().count()];
-        if [tiles, trainable] != own.map(Some) {
-            return Err(format!(
-                "has {tiles:?} tiles and {trainable:?} parameters in this step, and this rank has {own:?}"
-            ));
+        if reader.0.is_empty() {
+            return Err("cannot send its gradients".into());
+        }
+        let (tiles, trainable) = (reader.number().ok_or_else(damaged)?, reader.number().ok_or_else(damaged)?);
+        let own = params.trainable().count();
+        if (tiles, trainable) != (count, own) {
+            let here = format!("this rank has {count} and {own}");
+            return Err(format!("has {tiles} tiles and {trainable} parameters in this step, and {here}"));
         }
         for slot in slots {
-            let bytes = reader.bytes().ok_or_else(damaged)?;
-            results[slot] = postcard::from_bytes(bytes).map_err(|_| damaged())?;
-            let tiles = (slot..count).step_by(SLOTS);
-            if results[slot].len() != tiles.len() {
-                return Err(damaged());
+            for _ in (slot..count).step_by(SLOTS) {
+                let result = reader.bytes().and_then(|bytes| postcard::from_bytes(bytes).ok());
+                results[slot].push(result.ok_or_else(damaged)?);
             }
             for (i, id) in params.trainable().enumerate() {
                 let (shape, name) = (params.get(id).shape(), params.name(id));
-                if reader.number().ok_or_else(damaged)? == 1 {
+                if reader.number().filter(|is_set| *is_set < 2).ok_or_else(damaged)? == 1 {
                     let sum = reader.tensor().filter(|sum| sum.shape() == shape).ok_or_else(damaged)?;
                     self.slots[slot].sums[i] = (true, Some(sum));
                 }
@@ -429,7 +435,8 @@ mod tests {
     fn store() -> (Params<f32>, [ParamId; 3]) {
         let mut params = Params::new();
         let value = |i: usize| (i as f32 * 0.37).sin();
-        let ids = ["a", "b", "table"].map(|name| params.add(name, Tensor::from_fn(&[6, 3], value)));
+        let mut add = |name: &str, shape: [usize; 2]| params.add(name, Tensor::from_fn(&shape, value));
+        let ids = [add("a", [6, 3]), add("b", [4, 3]), add("table", [7, 2])];
         (params, ids)
     }
 
@@ -438,7 +445,7 @@ mod tests {
         let x = Tensor::from_fn(&[4, 6], |i| ((i + 5 * tile) as f32).cos());
         let mut y = params.tape().constant(x).matmul(&params[a]);
         if tile % 3 == 1 {
-            y *= params[b].slice_axis(0, ..4);
+            y *= &params[b];
         }
         let rows = params[table].gather_rows([tile as u32 % 6, 2]).sum();
         let loss = y.square().sum() + rows.square();
@@ -465,7 +472,7 @@ mod tests {
             assert_eq!(grads.len(), 3);
             assert!(grads[2].is_rows() && grads[2].sparse().len() == count && grads[1].is_zero() == (count < 2));
             for (tile, share) in grads[2].sparse().iter().enumerate() {
-                let mut sums = raygrad_autograd::RowSums::new(6, 3);
+                let mut sums = raygrad_autograd::RowSums::new(7, 2);
                 share.as_rows().unwrap().scatter(&mut sums);
                 assert_eq!(sums.rows()[0], tile as u32 % 6, "in the order of the tiles");
             }
@@ -493,16 +500,19 @@ mod tests {
     }
 
     /// Gradients, results and sent bytes of two steps of 21 tiles on each of several ranks.
-    fn across(count: usize) -> Vec<(Vec<Vec<f32>>, Vec<f32>, u64)> {
+    fn across(count: usize, frozen: &str) -> Vec<(Vec<Vec<f32>>, Vec<f32>, u64)> {
         let train = |mut exchange: InProcess| {
             let (mut params, ids) = store();
+            params.freeze(|name| name == frozen);
             let mut tiles = Tiles::<f32>::new();
             let mut steps = (vec![], vec![], 0);
             for tile_count in [21, 5] {
                 let TileSums { grads, results } = tiles
                     .differentiate_across(&mut exchange, &params, tile_count, |tile, params, _| loss(tile, params, ids))
                     .unwrap();
-                assert!(grads[2].is_rows() && grads[2].sparse().len() == tile_count);
+                let table = grads.last().unwrap();
+                assert!(table.is_rows() && table.sparse().len() == tile_count);
+                let ids: Vec<ParamId> = params.trainable().collect();
                 for (grad, id) in grads.iter().zip(ids) {
                     let dense = grad.clone().into_dense(&Pool::none());
                     steps.0.push(dense.as_slice().to_vec());
@@ -522,24 +532,66 @@ mod tests {
 
     #[test]
     fn tiles_any_processes_give_same_bits() {
-        let (mut params, ids) = store();
+        for frozen in ["", "a"] {
+            let (mut params, ids) = store();
+            params.freeze(|name| name == frozen);
+            let mut tiles = Tiles::<f32>::new();
+            let mut expected = (vec![], vec![]);
+            for tile_count in [21, 5] {
+                let step = tiles.differentiate(&params, tile_count, |tile, params, _| loss(tile, params, ids));
+                let trainable: Vec<ParamId> = params.trainable().collect();
+                for (grad, id) in step.grads.iter().zip(trainable) {
+                    let dense = grad.clone().into_dense(&Pool::none());
+                    expected.0.push(dense.as_slice().to_vec());
+                    *params.get_mut(id) += &dense;
+                }
+                expected.1.extend(step.results);
+            }
+            for count in [1, 2, 3, 4, 5, 8, 11] {
+                for (rank, (grads, results, sent)) in across(count, frozen).into_iter().enumerate() {
+                    assert!((&grads, &results) == (&expected.0, &expected.1), "rank {rank} of {count}");
+                    assert_eq!(sent > 0, count > 1);
+                }
+            }
+        }
+    }
+
+    /// A contribution that cannot be sent, or one of an unknown kind.
+    #[derive(Clone)]
+    struct Foreign(Option<&'static str>);
+
+    impl SparseGrad<f32> for Foreign {
+        fn shape(&self) -> &[usize] {
+            &[7, 2]
+        }
+        fn add_to(&self, _: &mut Tensor<f32>) {}
+        fn to_parts(&self) -> Option<SparseParts<f32>> {
+            Some(SparseParts { kind: self.0?.into(), integers: [1, 2].into(), tensors: vec![] })
+        }
+    }
+
+    #[test]
+    fn sparse_gradients_need_parts_and_a_reader() {
+        let (params, ids) = store();
         let mut tiles = Tiles::<f32>::new();
-        let mut expected = (vec![], vec![]);
-        for tile_count in [21, 5] {
-            let step = tiles.differentiate(&params, tile_count, |tile, params, _| loss(tile, params, ids));
-            for (grad, id) in step.grads.iter().zip(ids) {
-                let dense = grad.clone().into_dense(&Pool::none());
-                expected.0.push(dense.as_slice().to_vec());
-                *params.get_mut(id) += &dense;
-            }
-            expected.1.extend(step.results);
-        }
-        for count in [1, 2, 3, 4, 5, 8, 11] {
-            for (rank, (grads, results, sent)) in across(count).into_iter().enumerate() {
-                assert!((&grads, &results) == (&expected.0, &expected.1), "rank {rank} of {count}");
-                assert_eq!(sent > 0, count > 1);
-            }
-        }
+        let results = tiles.run(&params, 3, 0..4, &|tile, params, (): &mut ()| loss(tile, params, ids));
+        tiles.slots[1].shares[2][0].1 = Arc::new(Foreign(None));
+        let error = tiles.message(&params, 3, 0..4, &results).unwrap_err();
+        assert_eq!(error, ExchangeError::NotSent { param: "table".into() });
+        tiles.slots[1].shares[2][0].1 = Arc::new(Foreign(Some("foreign")));
+        let message = tiles.message(&params, 3, 0..4, &results).unwrap();
+        let read = |mut tiles: Tiles<f32>| {
+            tiles.slots.iter_mut().for_each(|slot| slot.begin(3));
+            let mut results = vec![Vec::<f32>::new(); SLOTS];
+            tiles.receive(&params, 3, 0..4, &mut Reader(&message), &mut results)
+        };
+        let error = read(Tiles::new()).unwrap_err();
+        assert!(error.contains("of kind `foreign` for `table`"), "{error}");
+        let reader: ReadSparse<f32> = |shape, parts| {
+            let is_whole = shape == [7, 2] && *parts.integers == [1, 2] && parts.tensors.is_empty();
+            is_whole.then(|| Arc::new(Foreign(None)) as Arc<dyn SparseGrad<f32>>)
+        };
+        read(Tiles::new().with_reader("foreign", reader)).unwrap();
     }
 
     #[test]
@@ -561,7 +613,7 @@ mod tests {
         });
         for (rank, error) in errors.into_iter().enumerate() {
             let Some(ExchangeError::Differs { rank: other, what }) = error else { panic!("{error:?}") };
-            assert!(other == 1 - rank && what.contains(&format!("has Some({}) tiles", 4 - rank)), "{what}");
+            assert!(other == 1 - rank && what.contains(&format!("has {} tiles", 4 - rank)), "{what}");
         }
     }
 
@@ -580,6 +632,37 @@ mod tests {
         for len in 0..message.len() {
             assert!(read(&message[..len]).is_err(), "{len} bytes");
         }
+        assert!(read(&[&message[..], &[0]].concat()).is_err(), "a byte too many");
+        // The numbers of tiles, of parameters, and of bytes.
+        for at in [0, 8, 16] {
+            let mut message = message.clone();
+            message[at] ^= 1;
+            assert!(read(&message).is_err(), "byte {at}");
+        }
+        // Shares of foreign tiles, and of tiles that do not exist; a sum of another shape; an unknown kind; a missing row.
+        let refused = |change: &dyn Fn(&mut Tiles<f32>)| {
+            let mut tiles = Tiles::<f32>::new();
+            let results = tiles.run(&params, 9, 0..4, &|tile, params, (): &mut ()| loss(tile, params, ids));
+            change(&mut tiles);
+            read(&tiles.message(&params, 9, 0..4, &results).unwrap()).unwrap_err()
+        };
+        let rows = |shape: &[usize], row: u32| {
+            Arc::new(RowGrad::new(shape, [row].into(), Tensor::<f32>::ones(&[1, shape[1]]))) as Arc<dyn SparseGrad<f32>>
+        };
+        type Change<'a> = &'a dyn Fn(&mut Tiles<f32>);
+        let changes: [(&str, Change<'_>); 5] = [
+            ("tile of another slot", &|tiles| tiles.slots[1].shares[2][0].0 = 2),
+            ("tile 16 of 9", &|tiles| tiles.slots[0].shares[2][0].0 = 16),
+            ("shape of a sum", &|tiles| tiles.slots[0].sums[0].1 = Some(Tensor::ones(&[3, 6]))),
+            ("row 7 of 7", &|tiles| tiles.slots[0].shares[2][0].1 = rows(&[8, 2], 7)),
+            ("rows of width 3", &|tiles| tiles.slots[0].shares[2][0].1 = rows(&[7, 3], 0)),
+        ];
+        for (what, change) in changes {
+            assert!(refused(change).contains("cannot be read"), "{what}");
+        }
+        let mut fewer = results.clone();
+        fewer[2].clear();
+        assert!(read(&tiles.message(&params, 9, 0..4, &fewer).unwrap()).is_err(), "a result is missing");
         // Four slots have a sum of `a`, and one has one of `b`. Of sums over slots, one each is sent.
         tiles.add_pairs(|pair| pair.end <= 4);
         let summed = tiles.message(&params, 9, 0..4, &results).unwrap();

@@ -97,7 +97,7 @@ pub struct Args {
     /// For several programs, such as a job array, that evaluate one run. Give each the same command with another I of
     /// I/N. The last one to finish writes the result. See `raygrad merge`.
     #[arg(long, help_heading = "Output", value_name = "I/N", conflicts_with = "json")]
-    shard: Option<Shard>,
+    pub shard: Option<Shard>,
     /// Print the result as JSON
     #[arg(long, help_heading = "Output")]
     json: bool,
@@ -210,6 +210,9 @@ pub fn run(args: &Args) -> Work<()> {
     let renderer = Renderer::new(model, args.precision)?;
     let judge = Judge { renderer, background: background.shown(), span, data, looks, appearance, lpips };
     let folder = run.file(&name);
+    if args.json && ranks::own().is_some() {
+        return Err(Error::setting("json", "needs a single process; the ranks write RUN/eval-SPLIT-SKIP.json").into());
+    }
     let Some(shard) = args.shard.or_else(ranks::shard) else {
         let report = all(judge, |views| Report::new(conditions, weights, vec![machine], views), &folder)?;
         if !args.json {

@@ -14,6 +14,7 @@ use super::messages::{ServerMessage, VideoRequest};
 use super::requests::{Requests, text};
 use crate::interrupt;
 use crate::output::{make_folder, remove};
+use crate::ranks;
 use crate::render::{frames_of, video_ending};
 use crate::run::Run;
 use crate::scene::Scene;
@@ -105,6 +106,7 @@ impl VideoJobs {
     fn spawn(self: &Arc<Self>, program: &Path, video: &VideoRequest, path: &Path, out: &Path) -> std::io::Result<()> {
         let mut command = Command::new(program);
         command.args(arguments(&self.run.folder, self.scene.as_ref(), video, path, out));
+        ranks::leave(&mut command);
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn()?;
         let input = child.stdin.take();
         let mut work = self.lock();

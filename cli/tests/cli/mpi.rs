@@ -79,6 +79,9 @@ fn ranks_share_frames_and_views() {
     let one = measured(place.succeeds("eval run"));
     assert_eq!(measured(succeeds(&place, 2, "eval run")), one);
     assert_eq!(one.len(), 3 + 1);
+    succeeds(&place, 2, "render run --frames 4 --size 8x6 --out ranks.gif");
+    place.succeeds("render run --frames 4 --size 8x6 --out one.gif");
+    assert_eq!(place.bytes("ranks.gif"), place.bytes("one.gif"));
     // A single image is rendered by one rank.
     succeeds(&place, 2, "render run --size 8x6 --out image.png");
 }
@@ -86,7 +89,8 @@ fn ranks_share_frames_and_views() {
 #[test]
 fn interrupted_rank_saves_the_run_of_all() {
     let place = Place::with_scene();
-    let output = disturbed(&place, "--budget 1h --checkpoint-every 1s", 1, "TERM");
+    // The checkpoint is that of the end.
+    let output = disturbed(&place, "--budget 1h --checkpoint-every 1h", 1, "TERM");
     assert_eq!(output.status.code(), Some(130), "{output:?}");
     assert_eq!(place.json("run/summary.json")["ended"], "interrupted");
     let stopped = place.json("run/summary.json")["steps"].as_u64().unwrap();
@@ -113,6 +117,8 @@ fn errors_of_a_rank_end_all() {
     let place = Place::with_scene();
     let output = on_ranks(&place, 2, "train missing --steps 3").output().unwrap();
     assert!(!output.status.success() && said(&output).contains("raygrad: rank 0: missing:"), "{}", said(&output));
-    let output = on_ranks(&place, 2, "doctor scene").output().unwrap();
-    assert!(said(&output).contains("only train, render and eval share their work"), "{}", said(&output));
+    let output = on_ranks(&place, 2, "train scene --steps 3 --port 8000").output().unwrap();
+    assert_eq!(said(&output).matches("--host and --port need --view").count(), 1, "{}", said(&output));
+    let output = on_ranks(&place, 2, "eval run --json").output().unwrap();
+    assert!(!output.status.success(), "{output:?}");
 }

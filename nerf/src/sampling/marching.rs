@@ -244,7 +244,7 @@ impl<T: Scalar> Sampler<T> for Marching {
 
     /// Updates some cells from the field's densities.
     fn update(&mut self, progress: &Progress, densities: &DensityFn<'_>) -> bool {
-        let alone = &mut |own| Some(vec![own]);
+        let alone = &mut |own, _: &[usize]| Some(vec![own]);
         Sampler::<T>::update_shared(self, progress, densities, &mut Shares { rank: 0, ranks: 1, gather: alone })
     }
 

@@ -192,7 +192,10 @@ impl Trainer {
     /// # Errors
     /// If a process is lost, or differs from rank 0. The error says in what. Then nothing is shared.
     pub fn share(&mut self, exchange: Box<dyn Exchange>) -> Result<()> {
-        self.across = Some(Across::new(exchange, &self.model, &self.data, (self.done.step, self.batch))?);
+        let mut state = self.groups.state(&self.model.params)?;
+        self.model.sampler.training_state().into_iter().for_each(|(_, bytes)| state.extend(bytes));
+        let place = (self.done.step, self.batch);
+        self.across = Some(Across::new(exchange, (&self.model, &state), &self.data, place)?);
         Ok(())
     }
 
@@ -210,9 +213,10 @@ impl Trainer {
     }
 
     /// Agrees with the other processes on the training time and on whether the run goes on.
-    fn agrees_to_go_on(&mut self) -> bool {
+    fn agrees_to_go_on(&mut self, budget: Budget) -> bool {
         let Some(across) = &mut self.across else { return true };
-        let agreed = across.begin(self.done.step, self.elapsed);
+        let place = (self.done.step, self.elapsed);
+        let agreed = across.begin(place, (budget, self.lr_scale), &self.model.params);
         self.elapsed = agreed.unwrap_or(self.elapsed);
         agreed.is_some()
     }
@@ -221,7 +225,8 @@ impl Trainer {
     ///
     /// `observe` is called after every step; its time does not count.
     pub fn run(&mut self, budget: Budget, mut observe: impl FnMut(&Trainer) -> ControlFlow<()>) {
-        while self.agrees_to_go_on() {
+        self.across.iter_mut().for_each(|across| across.stops = false);
+        while self.agrees_to_go_on(budget) {
             let fraction = match budget {
                 Budget::Steps(steps) => self.done.step as f64 / steps.max(1) as f64,
                 Budget::Time(time) => self.elapsed.as_secs_f64() / time.as_secs_f64().max(1e-9),
@@ -230,12 +235,15 @@ impl Trainer {
                 break;
             }
             self.step(fraction);
+            if self.exchange_error().is_some() {
+                break;
+            }
             let breaks = observe(self).is_break();
             match &mut self.across {
                 // The others learn of it before the next step.
-                Some(across) if across.error.is_none() => across.stops = breaks,
-                _ if breaks => break,
-                _ => {}
+                Some(across) => across.stops = breaks,
+                None if breaks => break,
+                None => {}
             }
             if self.done.has_diverged() {
                 break;
@@ -253,8 +261,11 @@ impl Trainer {
     }
 
     /// Performs one training step; `fraction` of the run (0 to 1) sets the schedules. If the step is
-    /// [shared](Self::share) and a process is lost, the parameters and the statistics stay as they are.
+    /// [shared](Self::share) and a process is lost, no gradient step is made, and the statistics stay as they are.
     pub fn step(&mut self, fraction: f64) -> StepStats {
+        if self.exchange_error().is_some() {
+            return self.done;
+        }
         self.check_poses(fraction);
         let start = (self.clock)();
         if self.model.config.camera_optimizer.coarse > 0.0 {
@@ -420,7 +431,7 @@ impl Trainer {
             None => sampler.update(progress, &density),
             Some(across) => {
                 let (rank, ranks) = (across.exchange.rank(), across.exchange.ranks());
-                let gather = &mut |own: Vec<f32>| across.gather(&own);
+                let gather = &mut |own: Vec<f32>, counts: &[usize]| across.gather(&own, counts);
                 sampler.update_shared(progress, &density, &mut Shares { rank, ranks, gather })
             }
         };

@@ -89,14 +89,13 @@ mod tests {
     /// Densities and colours of a region as leaves, and what rays see of it.
     fn region<'t>(tape: &'t Tape<f64>, region: usize) -> ([Var<'t, f64>; 2], Region<'t, f64>) {
         let sigma = tape.leaf(Tensor::from_fn(&[RAYS * SAMPLES], |i| density(region, i / SAMPLES, i % SAMPLES)));
-        let light = tape.leaf(Tensor::from_fn(&[RAYS * SAMPLES, 3], |i| {
-            light(region, i / 3 / SAMPLES, i / 3 % SAMPLES, i % 3)
-        }));
+        let light = tape
+            .leaf(Tensor::from_fn(&[RAYS * SAMPLES, 3], |i| light(region, i / 3 / SAMPLES, i / 3 % SAMPLES, i % 3)));
         let x = tape.apply(OpticalDepth::new(Tensor::full(&[RAYS * SAMPLES], 0.2)), &[&sigma]);
         let segments = Segments::new((0..=RAYS).map(|ray| (ray * SAMPLES) as u32).collect::<Vec<_>>());
         let w = weights(&x, &segments);
         let color = accumulate(&w, &light, &segments);
-        let transmittance = (-x.reshape(&[RAYS, SAMPLES]).sum_axis(1)).exp();
+        let transmittance = (-x.reshape(&[RAYS, SAMPLES]).sum_over(1)).exp();
         let entry = (0..RAYS).map(|ray| place(region, ray) as f64).collect();
         ([sigma, light], Region { color, transmittance, entry })
     }
@@ -124,7 +123,7 @@ mod tests {
         let x = tape.apply(OpticalDepth::new(Tensor::full(&[RAYS * all], 0.2)), &[&sigma]);
         let segments = Segments::new((0..=RAYS).map(|ray| (ray * all) as u32).collect::<Vec<_>>());
         let color = accumulate(&weights(&x, &segments), &colors, &segments);
-        let transmittance = (-x.reshape(&[RAYS, all]).sum_axis(1)).exp();
+        let transmittance = (-x.reshape(&[RAYS, all]).sum_over(1)).exp();
         let result = (color, transmittance);
         let grads = loss(&result).grad(&[&sigma, &colors]);
         let of_region = |region: usize| {

@@ -1,6 +1,6 @@
 //! Ranks as threads of one process.
 
-use super::{Exchange, ExchangeError, check_parts};
+use super::{Exchange, ExchangeError, FirstError, TIMEOUT, after, check_parts};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
@@ -13,6 +13,7 @@ pub struct InProcess {
     from: Vec<Receiver<Vec<u8>>>,
     timeout: Duration,
     sent: u64,
+    failed: FirstError,
 }
 
 impl InProcess {
@@ -27,27 +28,11 @@ impl InProcess {
                 receiver.push(start);
             }
         }
-        let rank = |(rank, (to, from))| InProcess { rank, to, from, timeout: Duration::from_secs(600), sent: 0 };
+        let rank = |(rank, (to, from))| InProcess { rank, to, from, timeout: TIMEOUT, sent: 0, failed: None };
         to.into_iter().zip(from).enumerate().map(rank).collect()
     }
 
-    /// Sets how long a rank waits for another one. Default: 10 minutes.
-    pub fn with_timeout(self, timeout: Duration) -> Self {
-        InProcess { timeout, ..self }
-    }
-}
-
-impl Exchange for InProcess {
-    fn rank(&self) -> usize {
-        self.rank
-    }
-
-    fn ranks(&self) -> usize {
-        self.to.len()
-    }
-
-    fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
-        check_parts(parts, self.ranks());
+    fn round(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
         let lost = |rank| ExchangeError::Lost { rank, what: "its thread has ended".into() };
         for (rank, part) in parts.iter().enumerate() {
             self.to[rank].send(part.to_vec()).map_err(|_| lost(rank))?;
@@ -62,8 +47,50 @@ impl Exchange for InProcess {
         };
         self.from.iter().enumerate().map(receive).collect()
     }
+}
+
+impl Exchange for InProcess {
+    fn rank(&self) -> usize {
+        self.rank
+    }
+
+    fn ranks(&self) -> usize {
+        self.to.len()
+    }
+
+    fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
+        check_parts(parts, self.ranks());
+        let result = after(&self.failed.clone(), || self.round(parts));
+        self.failed = result.as_ref().err().cloned();
+        result
+    }
+
+    fn set_timeout(&mut self, timeout: Duration) {
+        self.timeout = timeout;
+    }
 
     fn sent_bytes(&self) -> u64 {
         self.sent
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn first_error_stays_and_late_messages_meet_no_later_round() {
+        let [mut first, mut second] = <[_; 2]>::try_from(InProcess::ranks(2)).unwrap();
+        let short = Duration::from_millis(20);
+        first.set_timeout(short);
+        let error = Err(ExchangeError::TimedOut { rank: 1, after: short });
+        assert_eq!(first.all_gather(&[1]), error);
+        // Rank 1 comes late, and gets what rank 0 has sent in that round. Rank 0 does not take it for its next one.
+        assert_eq!(second.all_gather(&[1]), Ok(vec![vec![1], vec![1]]));
+        assert_eq!(first.all_gather(&[2]), error);
+        drop(first);
+        second.set_timeout(short);
+        let lost = Err(ExchangeError::Lost { rank: 0, what: "its thread has ended".into() });
+        assert_eq!((second.all_gather(&[2]), second.all_gather(&[2])), (lost.clone(), lost));
     }
 }

@@ -42,7 +42,7 @@ pub trait Exchange: Send {
     /// itself comes back too. Waits until all messages are here.
     ///
     /// # Errors
-    /// If a rank has ended, or has sent nothing for too long. After an error, no further call succeeds.
+    /// If a rank has ended, or has sent nothing for too long. All further calls return this error.
     ///
     /// # Panics
     /// If there is not one part for each rank.
@@ -55,6 +55,9 @@ pub trait Exchange: Send {
     fn all_gather(&mut self, own: &[u8]) -> Result<Vec<Vec<u8>>, ExchangeError> {
         self.all_to_all(&vec![own; self.ranks()])
     }
+
+    /// Sets how long this rank waits for another one.
+    fn set_timeout(&mut self, timeout: Duration);
 
     /// Bytes that this rank has sent to others so far.
     fn sent_bytes(&self) -> u64;
@@ -99,6 +102,17 @@ pub enum ExchangeError {
     /// The processes cannot be connected.
     #[error("{0}")]
     Connection(String),
+}
+
+/// How long ranks wait for one another, unless [`Exchange::set_timeout`] says otherwise.
+const TIMEOUT: Duration = Duration::from_secs(600);
+
+/// The first error of an exchange: after it, messages of different rounds could meet.
+type FirstError = Option<ExchangeError>;
+
+/// The result of a round, unless one before it has failed.
+fn after<R>(first: &FirstError, round: impl FnOnce() -> Result<R, ExchangeError>) -> Result<R, ExchangeError> {
+    first.clone().map_or_else(round, Err)
 }
 
 /// Asserts that there is one part for each rank.

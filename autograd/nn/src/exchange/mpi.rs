@@ -1,6 +1,6 @@
 //! Ranks of an MPI job.
 
-use super::{Exchange, ExchangeError, check_parts};
+use super::{Exchange, ExchangeError, FirstError, after, check_parts};
 use mpi::Threading;
 use mpi::environment::Universe;
 use mpi::request::{StaticScope, scope};
@@ -37,6 +37,7 @@ pub struct Mpi {
     ranks: usize,
     timeout: Duration,
     sent: u64,
+    failed: FirstError,
 }
 
 impl Mpi {
@@ -54,7 +55,7 @@ impl Mpi {
         let world = universe.world();
         let [rank, ranks] = [world.rank(), world.size()].map(|x| x as usize);
         UNIVERSE.set(Some(ManuallyDrop::new(universe)));
-        Ok(Mpi { rank, ranks, timeout, sent: 0 })
+        Ok(Mpi { rank, ranks, timeout, sent: 0, failed: None })
     }
 
     /// Ends MPI if this thread has initialised it. Waits for the other ranks.
@@ -128,6 +129,22 @@ impl Exchange for Mpi {
 
     fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
         check_parts(parts, self.ranks);
+        let result = after(&self.failed.clone(), || self.round(parts));
+        self.failed = result.as_ref().err().cloned();
+        result
+    }
+
+    fn set_timeout(&mut self, timeout: Duration) {
+        self.timeout = timeout;
+    }
+
+    fn sent_bytes(&self) -> u64 {
+        self.sent
+    }
+}
+
+impl Mpi {
+    fn round(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
         let error = |what: &str| Err(ExchangeError::Connection(what.into()));
         if UNIVERSE.with_borrow(Option::is_none) {
             return error("MPI has ended, or is used on another thread than the one that initialised it");
@@ -145,21 +162,34 @@ impl Exchange for Mpi {
             for from in self.others() {
                 let from_rank = process(&world, from);
                 let Some(status) = self.within_timeout(|| from_rank.immediate_probe_with_tag(MESSAGE)) else {
-                    let error = ExchangeError::TimedOut { rank: from, after: self.timeout };
-                    eprintln!("raygrad: rank {}: {error}; the job is aborted", self.rank);
-                    Mpi::abort(1);
+                    self.give_up(from);
                 };
                 let mut message = vec![0_u8; status.count(u8::equivalent_datatype()) as usize];
                 from_rank.receive_into_with_tag(&mut message[..], MESSAGE);
                 received[from] = message;
             }
-            sends.into_iter().for_each(|request| _ = request.wait());
+            for (request, to) in sends.into_iter().zip(self.others()) {
+                let mut request = Some(request);
+                let is_sent = self.within_timeout(|| match request.take()?.test() {
+                    Ok(_) => Some(()),
+                    Err(waiting) => {
+                        request = Some(waiting);
+                        None
+                    }
+                });
+                if is_sent.is_none() {
+                    self.give_up(to);
+                }
+            }
         });
         self.sent += self.others().map(|to| parts[to].len() as u64).sum::<u64>();
         Ok(received)
     }
 
-    fn sent_bytes(&self) -> u64 {
-        self.sent
+    /// Ends the job because a rank has stopped within a message.
+    fn give_up(&self, rank: usize) -> ! {
+        let error = ExchangeError::TimedOut { rank, after: self.timeout };
+        eprintln!("raygrad: rank {}: {error}; the job is aborted", self.rank);
+        Mpi::abort(1);
     }
 }

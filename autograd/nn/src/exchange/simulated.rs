@@ -1,6 +1,6 @@
 //! Ranks in one process, with the times of a network.
 
-use super::{Exchange, ExchangeError, InProcess, check_parts};
+use super::{Exchange, ExchangeError, FirstError, InProcess, TIMEOUT, after, check_parts};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use std::time::Duration;
@@ -51,6 +51,7 @@ pub struct Simulated {
     free: [f64; 2],
     rng: Pcg64Mcg,
     sent: u64,
+    failed: FirstError,
 }
 
 impl Simulated {
@@ -66,17 +67,13 @@ impl Simulated {
             rng: Pcg64Mcg::seed_from_u64(exchange.rank() as u64),
             exchange,
             link,
-            timeout: Duration::from_secs(600),
+            timeout: TIMEOUT,
+            failed: None,
             now: 0.0,
             free: [0.0; 2],
             sent: 0,
         };
         InProcess::ranks(count).into_iter().map(rank).collect()
-    }
-
-    /// Sets how long a rank waits for another one, by the simulated clock. Default: 10 minutes.
-    pub fn with_timeout(self, timeout: Duration) -> Self {
-        Simulated { timeout, ..self }
     }
 
     /// Lets time pass, for work between exchanges.
@@ -115,8 +112,25 @@ impl Exchange for Simulated {
     }
 
     fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
+        check_parts(parts, self.ranks());
+        let result = after(&self.failed.clone(), || self.round(parts));
+        self.failed = result.as_ref().err().cloned();
+        result
+    }
+
+    /// Sets how long a rank waits for another one, by the simulated clock.
+    fn set_timeout(&mut self, timeout: Duration) {
+        self.timeout = timeout;
+    }
+
+    fn sent_bytes(&self) -> u64 {
+        self.sent
+    }
+}
+
+impl Simulated {
+    fn round(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
         let (rank, ranks) = (self.rank(), self.ranks());
-        check_parts(parts, ranks);
         // Ranks after this one come first, so that not all send to rank 0 at a time.
         let mut messages = vec![vec![]; ranks];
         for to in (rank..rank + ranks).map(|to| to % ranks) {
@@ -148,10 +162,6 @@ impl Exchange for Simulated {
         }
         received.iter_mut().for_each(|message| drop(message.drain(..16)));
         Ok(received)
-    }
-
-    fn sent_bytes(&self) -> u64 {
-        self.sent
     }
 }
 
@@ -202,19 +212,32 @@ mod tests {
         };
         let [without, with] = [0.0, 0.2].map(|loss| clocks(Simulated::ranks(2, link(loss)), gather));
         assert_eq!(without, [Duration::from_millis(102); 2]);
-        // A fifth of 70 packets, each with a round trip and its own time, and some of them twice.
-        assert!(
-            with.iter().all(|&time| time > Duration::from_millis(150) && time < Duration::from_millis(300)),
-            "{with:?}"
-        );
+        // Each lost packet costs its own time, 1.448 ms, and a round trip of 4 ms. A fifth of 70 is lost, some twice.
+        let lost = with.iter().map(|time| (time.as_secs_f64() - 0.102) / 5.448e-3).collect::<Vec<_>>();
+        assert!(lost.iter().all(|lost| (lost - lost.round()).abs() < 1e-6 && (8.0..30.0).contains(lost)), "{lost:?}");
         assert_eq!(with, clocks(Simulated::ranks(2, link(0.2)), gather));
     }
 
     #[test]
+    fn messages_of_all_sizes_take_their_own_time() {
+        let bytes = |from: usize, to: usize| 1000 * (1 + 4 * from + 2 * to);
+        let run = |exchange: &mut Simulated| {
+            let rank = exchange.rank();
+            let parts: Vec<Vec<u8>> = (0..3).map(|to| vec![0; bytes(rank, to)]).collect();
+            let parts: Vec<&[u8]> = parts.iter().map(|part| &part[..]).collect();
+            exchange.all_to_all(&parts).unwrap();
+        };
+        // A kilobyte takes 1 ms. Rank 0 sends 3 to rank 1 and then 5 to rank 2; rank 1 sends 9 to 2, then 5 to 0; rank 2
+        // sends 9 to 0, then 11 to 1. So rank 0 has its messages after 9 + 2 and 9 + 5 + 2, rank 1 after 3 + 2 and
+        // 9 + 11 + 2, and rank 2 after 3 + 5 + 2 and then 8 + 2 + 9, since both come at once.
+        let expected = [16, 22, 19].map(Duration::from_millis);
+        assert_eq!(clocks(Simulated::ranks(3, link(0.0)), run), expected);
+    }
+
+    #[test]
     fn a_rank_that_is_too_late_is_named() {
-        let mut ranks =
-            Simulated::ranks(2, link(0.0)).into_iter().map(|rank| rank.with_timeout(Duration::from_secs(5)));
-        let [mut first, mut second] = [ranks.next().unwrap(), ranks.next().unwrap()];
+        let [mut first, mut second] = <[_; 2]>::try_from(Simulated::ranks(2, link(0.0))).unwrap();
+        first.set_timeout(Duration::from_secs(5));
         second.work(Duration::from_secs(6));
         let other = std::thread::spawn(move || second.all_gather(&[]).map(drop));
         assert_eq!(first.all_gather(&[]), Err(ExchangeError::TimedOut { rank: 1, after: Duration::from_secs(5) }));

@@ -1,9 +1,10 @@
 //! Ranks on several machines, connected by TCP.
 
-use super::{Exchange, ExchangeError, check_parts};
+use super::{Exchange, ExchangeError, FirstError, after, check_parts};
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{TcpListener, TcpStream, ToSocketAddrs};
 use std::sync::mpsc::{Sender, channel};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// Time between attempts to connect.
@@ -19,13 +20,23 @@ pub struct Tcp {
     peers: Vec<Option<Peer>>,
     timeout: Duration,
     sent: u64,
+    failed: FirstError,
 }
 
 #[derive(Debug)]
 struct Peer {
     incoming: TcpStream,
     /// To the thread that writes, so that two ranks that send much to each other do not wait for one another.
-    outgoing: Sender<Vec<u8>>,
+    outgoing: Option<Sender<Vec<u8>>>,
+    writer: Option<JoinHandle<()>>,
+}
+
+impl Drop for Peer {
+    /// Waits until the last messages are sent: the other rank may still need them.
+    fn drop(&mut self) {
+        self.outgoing = None;
+        self.writer.take().map(JoinHandle::join);
+    }
 }
 
 impl Tcp {
@@ -62,21 +73,22 @@ impl Tcp {
         let mut peers: Vec<Option<Peer>> = addresses.iter().map(|_| None).collect();
         // Each rank calls those before it, and says who it is.
         for (other, address) in addresses[..rank].iter().enumerate() {
-            let stream = retry(until, || TcpStream::connect(address)).map_err(|error| absent(other, error))?;
+            let stream = retry(until, || call(address, until)).map_err(|error| absent(other, error))?;
             let mut own = &stream;
-            own.write_all(&(rank as u64).to_le_bytes()).map_err(|error| absent(other, error))?;
+            own.write_all(&greeting(rank, addresses.len())).map_err(|error| absent(other, error))?;
             peers[other] = Some(Peer::new(stream, timeout).map_err(|error| absent(other, error))?);
         }
         for _ in rank + 1..addresses.len() {
             let missing = || (rank + 1..addresses.len()).find(|&other| peers[other].is_none()).unwrap_or(rank);
-            let (other, stream) = retry(until, || accept(&listener)).map_err(|error| absent(missing(), error))?;
-            if other <= rank || other >= addresses.len() || peers[other].is_some() {
-                let what = format!("rank {rank}: another program, or a second rank {other}, connects to its address");
+            let accepted = retry(until, || accept(&listener, rank, addresses.len()));
+            let (other, stream) = accepted.map_err(|error| absent(missing(), error))?;
+            if peers[other].is_some() {
+                let what = format!("rank {rank}: a second rank {other} connects to its address");
                 return Err(ExchangeError::Connection(what));
             }
             peers[other] = Some(Peer::new(stream, timeout).map_err(|error| absent(other, error))?);
         }
-        Ok(Tcp { rank, peers, timeout, sent: 0 })
+        Ok(Tcp { rank, peers, timeout, sent: 0, failed: None })
     }
 }
 
@@ -90,26 +102,56 @@ fn retry<R>(until: Instant, mut attempt: impl FnMut() -> io::Result<R>) -> io::R
     }
 }
 
-/// Accepts a connection, and reads which rank it is, without waiting for one.
-fn accept(listener: &TcpListener) -> io::Result<(usize, TcpStream)> {
+/// What a rank says first: that it is one, and which.
+fn greeting(rank: usize, ranks: usize) -> [u8; 24] {
+    let mut greeting = *b"raygrad\n................";
+    greeting[8..16].copy_from_slice(&(rank as u64).to_le_bytes());
+    greeting[16..].copy_from_slice(&(ranks as u64).to_le_bytes());
+    greeting
+}
+
+/// Connects to one of the addresses of a name.
+fn call(name: &impl ToSocketAddrs, until: Instant) -> io::Result<TcpStream> {
+    let mut last = Err(ErrorKind::AddrNotAvailable.into());
+    for address in name.to_socket_addrs()? {
+        let left = until.saturating_duration_since(Instant::now()).max(RETRY);
+        last = TcpStream::connect_timeout(&address, left);
+        if last.is_ok() {
+            break;
+        }
+    }
+    last
+}
+
+/// Accepts a connection of a later rank, without waiting for one. Others are closed.
+fn accept(listener: &TcpListener, rank: usize, ranks: usize) -> io::Result<(usize, TcpStream)> {
     listener.set_nonblocking(true)?;
     let (mut stream, _) = listener.accept()?;
     stream.set_nonblocking(false)?;
     stream.set_read_timeout(Some(Duration::from_secs(1)))?;
-    let mut rank = [0; 8];
-    stream.read_exact(&mut rank)?;
-    Ok((u64::from_le_bytes(rank) as usize, stream))
+    let mut said = [0; 24];
+    stream.read_exact(&mut said)?;
+    match (rank + 1..ranks).find(|other| said == greeting(*other, ranks)) {
+        Some(other) => Ok((other, stream)),
+        None => Err(ErrorKind::InvalidData.into()),
+    }
 }
 
 impl Peer {
     fn new(incoming: TcpStream, timeout: Duration) -> io::Result<Self> {
         incoming.set_nodelay(true)?;
-        incoming.set_read_timeout(Some(timeout))?;
-        let mut writer = incoming.try_clone()?;
+        let mut stream = incoming.try_clone()?;
         let (outgoing, messages) = channel::<Vec<u8>>();
         // It ends with the sender. If the connection breaks, the reader notices.
-        std::thread::spawn(move || messages.iter().try_for_each(|message| writer.write_all(&message)));
-        Ok(Peer { incoming, outgoing })
+        let write = move || drop(messages.iter().try_for_each(|message| stream.write_all(&message)));
+        let peer = Peer { incoming, outgoing: Some(outgoing), writer: Some(std::thread::spawn(write)) };
+        peer.set_timeout(timeout)?;
+        Ok(peer)
+    }
+
+    fn set_timeout(&self, timeout: Duration) -> io::Result<()> {
+        self.incoming.set_read_timeout(Some(timeout))?;
+        self.incoming.set_write_timeout(Some(timeout))
     }
 
     fn receive(&mut self) -> io::Result<Vec<u8>> {
@@ -134,6 +176,24 @@ impl Exchange for Tcp {
 
     fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
         check_parts(parts, self.ranks());
+        let result = after(&self.failed.clone(), || self.round(parts));
+        self.failed = result.as_ref().err().cloned();
+        result
+    }
+
+    fn set_timeout(&mut self, timeout: Duration) {
+        self.timeout = timeout;
+        // A connection that refuses it has ended, which the next exchange finds.
+        self.peers.iter().flatten().for_each(|peer| drop(peer.set_timeout(timeout)));
+    }
+
+    fn sent_bytes(&self) -> u64 {
+        self.sent
+    }
+}
+
+impl Tcp {
+    fn round(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
         // Ranks after this one come first, so that not all send to rank 0 at a time.
         let (rank, ranks) = (self.rank, self.ranks());
         for to in (rank + 1..rank + ranks).map(|to| to % ranks) {
@@ -141,7 +201,7 @@ impl Exchange for Tcp {
             let message = [&(part.len() as u64).to_le_bytes(), part].concat();
             self.sent += part.len() as u64;
             // A rank that has ended is found below.
-            let _ = peer.outgoing.send(message);
+            let _ = peer.outgoing.as_ref().map(|outgoing| outgoing.send(message));
         }
         let after = self.timeout;
         let receive = |(rank, peer): (usize, &mut Option<Peer>)| {
@@ -153,10 +213,6 @@ impl Exchange for Tcp {
             })
         };
         self.peers.iter_mut().enumerate().map(receive).collect()
-    }
-
-    fn sent_bytes(&self) -> u64 {
-        self.sent
     }
 }
 
@@ -216,6 +272,27 @@ mod tests {
             Some(error)
         });
         assert_eq!(errors[0], Some(ExchangeError::TimedOut { rank: 1, after: Duration::from_secs(1) }));
+    }
+
+    #[test]
+    fn strangers_are_ignored_and_last_messages_arrive() {
+        let listeners: Vec<_> = (0..2).map(|_| TcpListener::bind("127.0.0.1:0").unwrap()).collect();
+        let addresses: Vec<_> = listeners.iter().map(|listener| listener.local_addr().unwrap()).collect();
+        let mut stranger = TcpStream::connect(addresses[0]).unwrap();
+        stranger.write_all(&[7; 24]).unwrap();
+        // A rank of a job of three.
+        TcpStream::connect(addresses[0]).unwrap().write_all(&greeting(1, 3)).unwrap();
+        let start = |(rank, listener): (usize, TcpListener)| {
+            let addresses = addresses.clone();
+            std::thread::spawn(move || {
+                let mut tcp = Tcp::with_listener(rank, listener, &addresses, TIMEOUT).unwrap();
+                // Rank 1 sends much, receives nothing, and ends.
+                let part = vec![1; if rank == 1 { 20_000_000 } else { 0 }];
+                tcp.all_gather(&part).unwrap()[1].len()
+            })
+        };
+        let ranks: Vec<_> = listeners.into_iter().enumerate().map(start).collect();
+        ranks.into_iter().for_each(|rank| assert_eq!(rank.join().unwrap(), 20_000_000));
     }
 
     #[test]

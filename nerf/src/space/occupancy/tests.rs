@@ -48,6 +48,47 @@ fn balls(points: &[[f32; 3]], out: &mut [f32]) {
     }
 }
 
+#[test]
+fn shared_updates_equal_those_of_one_process() {
+    let grid = || grid(48, 2);
+    let plans = [Update::ALL, Update { every: 3, occupied_every: 2, ..Update::PARTIAL }, Update::PARTIAL];
+    let threshold = Threshold { min_sigma: 0.5, or_mean: false, dilate: false };
+    let mut alone = grid();
+    let mut evaluations = 0;
+    for (step, plan) in (0..).zip(&plans) {
+        evaluations += alone.update(plan, 5, step, &balls);
+        alone.threshold(&threshold);
+    }
+    for ranks in [1, 2, 3, 7] {
+        let update = |mut exchange: InProcess| {
+            let (mut grid, mut evaluations, rank) = (grid(), 0, exchange.rank());
+            let mut gather = |own: Vec<f32>, counts: &[usize]| {
+                assert_eq!(own.len(), counts[rank]);
+                let mut bytes = vec![];
+                f32::write_le(&own, &mut bytes);
+                let all = exchange.all_gather(&bytes).ok()?;
+                Some(all.iter().map(|bytes| f32::read_le(bytes)).collect())
+            };
+            for (step, plan) in (0..).zip(&plans) {
+                let shares = &mut Shares { rank, ranks, gather: &mut gather };
+                evaluations += grid.update_shared(plan, 5, step, &balls, shares);
+                grid.threshold(&threshold);
+            }
+            (grid.to_bytes(), evaluations)
+        };
+        let found: Vec<(Vec<u8>, u64)> = std::thread::scope(|scope| {
+            let update = &update;
+            let threads: Vec<_> =
+                InProcess::ranks(ranks).into_iter().map(|rank| scope.spawn(move || update(rank))).collect();
+            threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+        });
+        assert!(found.iter().all(|(bytes, _)| *bytes == alone.to_bytes()), "{ranks} ranks");
+        assert_eq!(found.iter().map(|(_, evaluations)| evaluations).sum::<u64>(), evaluations, "{ranks} ranks");
+        let fair = evaluations / ranks as u64;
+        assert!(found.iter().all(|(_, own)| (fair / 2..=2 * fair).contains(own)), "{ranks} ranks");
+    }
+}
+
 proptest! {
     #[test]
     fn dilation_equals_neighbour_sets(seed in 0..1000u64, share in 0.0..0.02f64, side in 1..5usize) {
@@ -387,44 +428,6 @@ fn occupancy_settings_out_of_range_are_errors() {
 }
 
 /// Colours of rays from all sides, and the number of samples: with the grid's samples.
-#[test]
-fn shared_updates_equal_those_of_one_process() {
-    let grid = || grid(48, 2);
-    let plans = [Update::ALL, Update { every: 3, occupied_every: 2, ..Update::PARTIAL }, Update::PARTIAL];
-    let threshold = Threshold { min_sigma: 0.5, or_mean: false, dilate: false };
-    let mut alone = grid();
-    let mut evaluations = 0;
-    for (step, plan) in (0..).zip(&plans) {
-        evaluations += alone.update(plan, 5, step, &balls);
-        alone.threshold(&threshold);
-    }
-    for ranks in [1, 2, 3, 7] {
-        let update = |mut exchange: InProcess| {
-            let (mut grid, mut evaluations, rank) = (grid(), 0, exchange.rank());
-            let mut gather = |own: Vec<f32>| {
-                let mut bytes = vec![];
-                f32::write_le(&own, &mut bytes);
-                let all = exchange.all_gather(&bytes).ok()?;
-                Some(all.iter().map(|bytes| f32::read_le(bytes)).collect())
-            };
-            for (step, plan) in (0..).zip(&plans) {
-                let shares = &mut Shares { rank, ranks, gather: &mut gather };
-                evaluations += grid.update_shared(plan, 5, step, &balls, shares);
-                grid.threshold(&threshold);
-            }
-            (grid.to_bytes(), evaluations)
-        };
-        let found: Vec<(Vec<u8>, u64)> = std::thread::scope(|scope| {
-            let update = &update;
-            let threads: Vec<_> =
-                InProcess::ranks(ranks).into_iter().map(|rank| scope.spawn(move || update(rank))).collect();
-            threads.into_iter().map(|thread| thread.join().unwrap()).collect()
-        });
-        assert!(found.iter().all(|(bytes, _)| *bytes == alone.to_bytes()), "{ranks} ranks");
-        assert_eq!(found.iter().map(|(_, evaluations)| evaluations).sum::<u64>(), evaluations, "{ranks} ranks");
-    }
-}
-
 fn render(grid: &OccupancyGrid, density: &DensityFn<'_>) -> (Vec<f32>, u64) {
     let mut rays = Rays::new();
     let mut rng = Pcg64Mcg::seed_from_u64(5);

@@ -29,10 +29,10 @@ pub struct Shares<'a> {
     pub rank: usize,
     /// Number of processes.
     pub ranks: usize,
-    /// Sends numbers to all processes, and returns those of each, by rank. `None` if that fails: the grid is then
-    /// updated in part.
+    /// Sends numbers to all processes, and returns those of each, by rank. The second argument is their number from each
+    /// rank. `None` if that fails: the grid is then updated in part.
     #[allow(clippy::type_complexity)]
-    pub gather: &'a mut dyn FnMut(Vec<f32>) -> Option<Vec<Vec<f32>>>,
+    pub gather: &'a mut dyn FnMut(Vec<f32>, &[usize]) -> Option<Vec<Vec<f32>>>,
 }
 
 /// The cells that [`OccupancyGrid::update`] samples, and how.
@@ -139,7 +139,7 @@ impl OccupancyGrid {
     /// # Panics
     /// If a value of `plan` is out of range.
     pub fn update(&mut self, plan: &Update, seed: u64, step: u64, density: &DensityFn<'_>) -> u64 {
-        let alone = &mut |own| Some(vec![own]);
+        let alone = &mut |own, _: &[usize]| Some(vec![own]);
         self.update_shared(plan, seed, step, density, &mut Shares { rank: 0, ranks: 1, gather: alone })
     }
 
@@ -167,26 +167,35 @@ impl OccupancyGrid {
         // Neighbouring tasks have similar numbers of occupied cells.
         let (rank, ranks) = (shares.rank, shares.ranks);
         let own = |word: usize| if word / TASK % ranks == rank { chosen(word) } else { 0 };
+        // Which cells those are depends on the old densities.
+        let cells = if ranks > 1 { self.cells_of_ranks(chosen, ranks) } else { vec![] };
         let count = self.look(&Places::random(plan.samples as usize), own, rng, keep, density);
         if ranks > 1 {
-            self.gather(chosen, shares);
+            self.gather(&cells, shares);
         }
         self.words = words;
         count
     }
 
-    /// Takes the densities of the chosen cells from the processes that have sampled them.
-    fn gather(&mut self, chosen: impl Fn(usize) -> u64, shares: &mut Shares<'_>) {
-        let (lattice, densities) = (&self.lattice, Arc::make_mut(&mut self.densities));
-        let mut of_ranks = vec![vec![]; shares.ranks];
-        for (word, densities) in densities.chunks_exact(CELLS).enumerate() {
-            let cells = cells(lattice, word, densities, &chosen);
-            of_ranks[word / TASK % shares.ranks].extend(bits_of(cells).map(|bit| word * CELLS + bit));
+    /// The chosen cells that each process samples, in order.
+    fn cells_of_ranks(&self, chosen: impl Fn(usize) -> u64, ranks: usize) -> Vec<Vec<u32>> {
+        let mut of_ranks = vec![vec![]; ranks];
+        for (word, densities) in self.densities.chunks_exact(CELLS).enumerate() {
+            let cells = cells(&self.lattice, word, densities, &chosen);
+            // A grid has at most 2^30 cells.
+            of_ranks[word / TASK % ranks].extend(bits_of(cells).map(|bit| (word * CELLS + bit) as u32));
         }
-        let own = of_ranks[shares.rank].iter().map(|&cell| densities[cell]).collect();
-        let Some(found) = (shares.gather)(own) else { return };
+        of_ranks
+    }
+
+    /// Takes the densities of these cells from the processes that have sampled them.
+    fn gather(&mut self, of_ranks: &[Vec<u32>], shares: &mut Shares<'_>) {
+        let densities = Arc::make_mut(&mut self.densities);
+        let own = of_ranks[shares.rank].iter().map(|&cell| densities[cell as usize]).collect();
+        let counts: Vec<usize> = of_ranks.iter().map(Vec::len).collect();
+        let Some(found) = (shares.gather)(own, &counts) else { return };
         for (cells, found) in of_ranks.iter().zip(found) {
-            cells.iter().zip(found).for_each(|(&cell, found)| densities[cell] = found);
+            cells.iter().zip(found).for_each(|(&cell, found)| densities[cell as usize] = found);
         }
     }
 

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::SceneBox;
-use raygrad_nn::InProcess;
+use raygrad_nn::{Exchange, ExchangeError, InProcess};
 
 /// Runs a trainer on each of several ranks, and returns what `run` makes of it.
 fn on_ranks<R: Send>(
@@ -10,7 +10,7 @@ fn on_ranks<R: Send>(
     trainer: impl Fn(usize) -> Trainer + Sync,
     run: impl Fn(usize, Trainer) -> R + Sync,
 ) -> Vec<R> {
-    let exchanges = InProcess::ranks(ranks).into_iter().map(|exchange| exchange.with_timeout(Duration::from_secs(60)));
+    let exchanges = InProcess::ranks(ranks).into_iter();
     std::thread::scope(|scope| {
         let start = |exchange: InProcess| {
             let (trainer, run) = (&trainer, &run);
@@ -18,6 +18,7 @@ fn on_ranks<R: Send>(
                 let rank = exchange.rank();
                 let mut trainer = trainer(rank);
                 trainer.share(Box::new(exchange)).unwrap();
+                trainer.exchange_mut().unwrap().set_timeout(Duration::from_secs(60));
                 run(rank, trainer)
             })
         };
@@ -38,19 +39,18 @@ fn state(mut trainer: Trainer) -> Vec<u8> {
 
 #[test]
 fn shared_steps_have_the_bits_of_one_process() {
-    // The second grid has several tasks, which ranks share; its updates come at steps 17 and 33.
+    // The third grid has several tasks, which ranks share; its updates come at steps 17 and 33.
     let mut large_grid = tiny_table();
-    if let Some(sampler) = large_grid.sampler.get_mut::<MarchingConfig>() {
-        sampler.occupancy.resolution = 48;
-    }
-    for config in [tiny(), tiny_table(), large_grid] {
+    large_grid.sampler.get_mut::<MarchingConfig>().unwrap().occupancy.resolution = 32;
+    let refined = tiny_table().with_refined(&[RefinedParam::Poses, RefinedParam::Exposure]);
+    for (config, steps) in [(tiny(), 12), (tiny_table(), 12), (large_grid, 36), (refined, 12)] {
         let run = |_: usize, mut trainer: Trainer| {
-            trainer.run(Budget::Steps(36), |_| ControlFlow::Continue(()));
+            trainer.run(Budget::Steps(steps), |_| ControlFlow::Continue(()));
             assert_eq!(trainer.exchange_error(), None);
             state(trainer)
         };
         let alone = run(0, trainer(config.clone()));
-        for ranks in [1, 2, 3, 5] {
+        for ranks in [2, 3] {
             let all = on_ranks(ranks, |_| trainer(config.clone()), run);
             assert!(all.iter().all(|state| *state == alone), "{ranks} ranks");
         }
@@ -145,6 +145,81 @@ fn lost_ranks_end_the_run_with_their_number() {
         assert!(*step == 5 && error.starts_with("rank "), "{error}");
     }
     assert!(ended.iter().any(|(_, error)| error.starts_with("rank 2 has ended")), "{ended:?}");
+}
+
+/// An exchange that fails at a call, counted from 0.
+struct Failing(InProcess, usize);
+
+impl Exchange for Failing {
+    fn rank(&self) -> usize {
+        self.0.rank()
+    }
+    fn ranks(&self) -> usize {
+        self.0.ranks()
+    }
+    fn all_to_all(&mut self, parts: &[&[u8]]) -> std::result::Result<Vec<Vec<u8>>, ExchangeError> {
+        if self.1 == 0 {
+            return Err(ExchangeError::Connection("unplugged".into()));
+        }
+        self.1 -= 1;
+        self.0.all_to_all(parts)
+    }
+    fn set_timeout(&mut self, timeout: Duration) {
+        self.0.set_timeout(timeout);
+    }
+    fn sent_bytes(&self) -> u64 {
+        self.0.sent_bytes()
+    }
+}
+
+#[test]
+fn failure_of_any_exchange_keeps_parameters_and_statistics() {
+    // A step has two exchanges, and step 17 one more for the grid. The first one checks the start.
+    let calls = 1 + 2 * 16;
+    let run = |exchange: InProcess, fails_at: usize| {
+        let mut trainer = trainer(tiny_table());
+        trainer.share(Box::new(Failing(exchange, fails_at))).unwrap();
+        let mut last = None;
+        trainer.run(Budget::Steps(50), |trainer| {
+            last = Some((trainer.model.params.clone(), trainer.stats().step));
+            ControlFlow::Continue(())
+        });
+        let (params, step) = last.unwrap();
+        assert_eq!(trainer.exchange_error(), Some(&ExchangeError::Connection("unplugged".into())));
+        assert_eq!((trainer.stats().step, step), (16, 16), "{fails_at}");
+        assert!(trainer.model.params.values().iter().zip(params.values()).all(|(a, b)| a == b));
+        // No step is made alone.
+        assert_eq!(trainer.step(0.5).step, 16);
+    };
+    for fails_at in [calls, calls + 1, calls + 2] {
+        std::thread::scope(|scope| {
+            let start = |exchange| scope.spawn(move || run(exchange, fails_at));
+            let ranks: Vec<_> = InProcess::ranks(2).into_iter().map(start).collect();
+            ranks.into_iter().for_each(|rank| rank.join().unwrap());
+        });
+    }
+}
+
+#[test]
+fn ranks_that_drift_apart_end_the_run() {
+    let ended = on_ranks(
+        2,
+        |_| trainer(tiny_table()),
+        |rank, mut trainer| {
+            trainer.run(Budget::Steps(100), |_| ControlFlow::Continue(()));
+            if rank == 1 {
+                let id = trainer.model.params.ids().next().unwrap();
+                let value = trainer.model.params.get_mut(id).as_mut_slice();
+                value[0] = value[0].next_up();
+            }
+            trainer.run(Budget::Steps(400), |_| ControlFlow::Continue(()));
+            (trainer.stats().step, trainer.exchange_error().unwrap().to_string())
+        },
+    );
+    for (rank, (step, error)) in ended.into_iter().enumerate() {
+        let expected = format!("rank {} has other parameters at step 256", 1 - rank);
+        assert!(step == 256 && error.starts_with(&expected), "{step} {error}");
+    }
 }
 
 #[test]
