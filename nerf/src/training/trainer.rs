@@ -212,7 +212,7 @@ impl Trainer {
         self.across.as_ref()?.error.as_ref()
     }
 
-    /// Agrees with the other processes on the training time and on whether the run goes on.
+    /// Agrees with the other processes on the training time, and whether to continue the run.
     fn agrees_to_go_on(&mut self, budget: Budget) -> bool {
         let Some(across) = &mut self.across else { return true };
         let place = (self.done.step, self.elapsed);
