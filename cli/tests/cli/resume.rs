@@ -337,12 +337,14 @@ fn diverged_run_returns_at_a_lower_lr() {
 #[test]
 fn run_diverging_again_ends_with_last_good_model() {
     let place = Place::empty();
-    // It learns until the learning rate is too large, at about 7 in 10 steps. Each return takes 100 steps without a finite
-    // value, and the next one comes 2 in 100 steps later: so there must be room for four.
+    // It learns until the learning rate is too large. Whether numbers overflow then, or all units rest, depends on the
+    // seed. With this one they overflow early: there is room for 100 steps without a finite value, four times.
     let schedule = r#"{"exponential":{"from":0.0001,"to":1e30,"warmup":0.0}}"#;
     let rates = format!("--set schedule={schedule} --checkpoint-every 0.02s");
-    let output =
-        place.command(&format!("train --downscale 10 --steps 800 --out run {SMALL} {rates}")).output().unwrap();
+    let output = place
+        .command(&format!("train --downscale 10 --steps 400 --seed 4 --out run {SMALL} {PLAIN} {rates}"))
+        .output()
+        .unwrap();
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     let [printed, said] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
     assert!(!printed.contains("raygrad render"), "{printed}");
