@@ -1,6 +1,6 @@
 //! The frames of a JSON file as views.
 
-use super::intrinsics::{check_known, contradiction};
+use super::intrinsics::check_known;
 use super::json::Object;
 use super::layers::Layers;
 use super::locate::{Located, locate};
@@ -119,7 +119,7 @@ impl Frames {
             let angle_y = dialect == Dialect::Transforms;
             let camera = layers[i].camera(pose, header, angle_y)?;
             if contradicting.is_none() {
-                contradicting = [frame, top].into_iter().find_map(|object| contradiction(object, &camera, angle_y));
+                contradicting = layers[i].contradiction(&camera, angle_y);
             }
             views.push(View {
                 image: image.as_ref().map(|image| image.path.clone()),

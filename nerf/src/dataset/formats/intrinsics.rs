@@ -154,6 +154,21 @@ impl Layers<'_, '_> {
         }
     }
 
+    /// A note on a field of view that contradicts the focal length of `camera`, which counts, as in other programs.
+    /// Those of fisheye lenses have several conventions.
+    pub(super) fn contradiction(&self, camera: &Camera, angle_y: bool) -> Option<String> {
+        if !matches!(camera.lens, Lens::Pinhole | Lens::Brown { .. }) || camera.width == 0 {
+            return None;
+        }
+        let size = [camera.width, camera.height];
+        if focal_of(self.frame, size, angle_y).ok()? != [None; 2] {
+            return contradiction(self.frame, size, angle_y);
+        }
+        // The file's lengths belong to its own size.
+        let own = Layers { top: self.top, frame: self.top }.size().ok()?;
+        contradiction(self.top, own.unwrap_or(size), angle_y)
+    }
+
     /// The focal lengths of a panorama of all directions, in pixels per radian.
     fn panorama(&self, [width, height]: [usize; 2]) -> Result<[f64; 2]> {
         let [w, h] = [width as f64, height as f64];
@@ -208,13 +223,8 @@ fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Opt
     Ok([axis("fl_x", "camera_angle_x", size[0])?, axis("fl_y", "camera_angle_y", size[1])?])
 }
 
-/// A note on a field of view that contradicts the focal length of the same object, which counts, as in other programs.
-/// Those of fisheye lenses have several conventions.
-pub(super) fn contradiction(object: &Object<'_>, camera: &Camera, angle_y: bool) -> Option<String> {
-    if !matches!(camera.lens, Lens::Pinhole | Lens::Brown { .. }) || camera.width == 0 {
-        return None;
-    }
-    let size = [camera.width, camera.height];
+/// A note on a field of view that contradicts the focal length of the same object.
+fn contradiction(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Option<String> {
     let given = focal_of(object, size, angle_y).ok()?;
     ["camera_angle_x", "camera_angle_y"].into_iter().zip(given).zip(size).find_map(|((angle, focal), side)| {
         let is_of_image = angle_y || angle == "camera_angle_x";

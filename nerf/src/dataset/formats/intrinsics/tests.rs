@@ -130,6 +130,29 @@ fn contradicting_angles_are_noted() {
     assert_eq!(notes(&matrix), [note("camera_angle_x", 0.7, x, 100.0)]);
     let of_frame = |d: &mut Value| set(&mut d["frames"][1], &json!({ "fl_x": 50, "fl_y": 50, "camera_angle_x": x }));
     assert_eq!(notes(&of_frame), [note("frames[1].camera_angle_x", x, angle(64.0, 50.0), 50.0)]);
+    // The file's lengths have the size of the file, and count for frames without their own.
+    let consistent = json!({ "camera_angle_x": x, "camera_angle_y": y });
+    let half = json!({ "w": 32, "h": 24, "fl_x": 50, "fl_y": 55 });
+    let smaller = |d: &mut Value| {
+        set(d, &consistent);
+        set(&mut d["frames"][0], &half);
+    };
+    assert_eq!(notes(&smaller), [""; 0]);
+    let later = |d: &mut Value| {
+        smaller(d);
+        set(&mut d["frames"][1], &json!({ "fl_x": 50, "fl_y": 50, "camera_angle_x": x }));
+    };
+    assert_eq!(notes(&later), [note("frames[1].camera_angle_x", x, angle(64.0, 50.0), 50.0)]);
+    let resized = |d: &mut Value| {
+        set(d, &consistent);
+        set(&mut d["frames"][0], &json!({ "w": 32, "h": 24 }));
+    };
+    assert_eq!(notes(&resized), [""; 0]);
+    let unused = |d: &mut Value| {
+        d["camera_angle_x"] = json!(0.8);
+        (0..2).for_each(|i| set(&mut d["frames"][i], &half));
+    };
+    assert_eq!(notes(&unused), [""; 0]);
     // A value that is no number was never used.
     assert_eq!(notes(&|d| d["camera_angle_x"] = json!("NaNa")), [""; 0]);
     // Those of a frame take the place of the file's. A fisheye has other angles.
