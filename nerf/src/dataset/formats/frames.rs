@@ -9,6 +9,7 @@ use crate::dataset::capture::View;
 use crate::dataset::photo::Photo;
 use crate::error::{Error, Result};
 use serde_json::Value;
+use std::cmp::Ordering;
 use std::collections::{BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
@@ -91,7 +92,7 @@ impl Frames {
         let masks = files(&all, "mask_path", folder, taken, &mut self.assumptions)?;
         let depths = Depths::of(top, &all, (folder, taken), &mut self.assumptions)?;
         let first = frames.iter().zip(images).find_map(|(frame, (_, image))| Some((frame, image.as_ref()?)));
-        let (mut common, mut turned, mut contradicting) = (None, BTreeSet::new(), None);
+        let (mut common, mut unclear, mut contradicting) = (None, BTreeSet::new(), None);
         let mut views = Vec::with_capacity(frames.len());
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
             check_known(frame)?;
@@ -107,9 +108,9 @@ impl Frames {
                 // An absent image is assumed to be as large as the first.
                 let own = image.as_ref().filter(|_| dialect == Dialect::Transforms).map(|image| (frame, image));
                 match (own, first) {
-                    (Some(own), _) => size(own, &mut turned),
+                    (Some(own), _) => size(top, own, &mut unclear),
                     (None, Some(first)) => {
-                        let size = common.map_or_else(|| size(first, &mut turned), Ok)?;
+                        let size = common.map_or_else(|| size(top, first, &mut unclear), Ok)?;
                         common = Some(size);
                         Ok(size)
                     }
@@ -130,8 +131,8 @@ impl Frames {
             });
         }
         self.assumptions.extend(contradicting);
-        if let Some(first) = turned.first() {
-            let (count, first) = (turned.len(), first.strip_prefix(folder).unwrap_or(first).display());
+        if let Some(first) = unclear.first() {
+            let (count, first) = (unclear.len(), first.strip_prefix(folder).unwrap_or(first).display());
             self.assumptions.push(format!(
                 "{count} images have an EXIF orientation but no `w` and `h`, such as `{first}`: used their pixels as \
                  stored; give the width and height of the turned images to turn them"
@@ -191,17 +192,32 @@ fn files(
     Ok(names.into_iter().map(|name| Some((name?, found.next().flatten()))).collect())
 }
 
-/// The stored size of a frame's image, from its header. Programs that measure cameras read no EXIF orientation; images
-/// with one of another size are added to `turned`.
-fn size((frame, image): (&Object<'_>, &Located), turned: &mut BTreeSet<PathBuf>) -> Result<[usize; 2]> {
-    let [stored, shown] = Photo::size_of_file(&image.path).map_err(|e| match e {
+/// The size of a frame's image, from its header. Programs that measure cameras read no EXIF orientation, so it is the
+/// stored size, unless the principal point is nearer to the middle of the turned image. Images whose two sizes differ
+/// are added to `unclear` without a principal point that decides.
+fn size(
+    top: &Object<'_>,
+    (frame, image): (&Object<'_>, &Located),
+    unclear: &mut BTreeSet<PathBuf>,
+) -> Result<[usize; 2]> {
+    let sizes = Photo::size_of_file(&image.path).map_err(|e| match e {
         Error::File { path, what } => frame.error("file_path", format!("{}: {what}", path.display())),
         other => other,
     })?;
-    if stored != shown {
-        turned.insert(image.path.clone());
+    let [stored, shown] = sizes.map(|size| size.map(|side| side * image.factor));
+    if stored == shown {
+        return Ok(stored);
     }
-    Ok(stored.map(|side| side * image.factor))
+    if let [Some(x), Some(y)] = (Layers { top, frame }).centre()? {
+        let distance = |[w, h]: [usize; 2]| f64::hypot(x - 0.5 * w as f64, y - 0.5 * h as f64);
+        match distance(stored).total_cmp(&distance(shown)) {
+            Ordering::Less => return Ok(stored),
+            Ordering::Greater => return Ok(shown),
+            Ordering::Equal => {}
+        }
+    }
+    unclear.insert(image.path.clone());
+    Ok(stored)
 }
 
 /// The file that accompanies an image. It must exist if the image does.

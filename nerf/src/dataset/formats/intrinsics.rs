@@ -116,19 +116,26 @@ impl Layers<'_, '_> {
             let focal = self.panorama([width, height])?;
             return Ok(Camera { width, height, focal, centre: middle, lens, pose });
         }
-        let mut centre = middle;
-        for (i, (value, name)) in centre.iter_mut().zip(["cx", "cy"]).enumerate() {
+        let [x, y] = self.centre()?;
+        let centre = [x.unwrap_or(middle[0]), y.unwrap_or(middle[1])];
+        let focal = self.focal([width, height], angle_y)?;
+        Ok(Camera { width, height, focal, centre, lens, pose })
+    }
+
+    /// The principal point, if the frame or the file gives it.
+    pub(super) fn centre(&self) -> Result<[Option<f64>; 2]> {
+        let axis = |i: usize, name: &str| {
             let of = |object: &Object<'_>| {
                 let of_matrix = matrix_of(object)?.map(|matrix| matrix[2 + i]);
                 agreeing(object, name, object.number(name)?, of_matrix)
             };
-            *value = of(self.frame)?.map_or_else(|| of(self.top), |own| Ok(Some(own)))?.unwrap_or(*value);
-            if value.abs() > CENTRE {
-                return Err(self.error(name, format!("must be a position in pixels, is {value}")));
+            let value = of(self.frame)?.map_or_else(|| of(self.top), |own| Ok(Some(own)))?;
+            match value.filter(|value| value.abs() > CENTRE) {
+                Some(value) => Err(self.error(name, format!("must be a position in pixels, is {value}"))),
+                None => Ok(value),
             }
-        }
-        let focal = self.focal([width, height], angle_y)?;
-        Ok(Camera { width, height, focal, centre, lens, pose })
+        };
+        Ok([axis(0, "cx")?, axis(1, "cy")?])
     }
 
     /// The focal lengths of the frame or, if it has none, of the file. A single one counts for both axes, as in

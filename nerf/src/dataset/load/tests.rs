@@ -222,15 +222,19 @@ fn masks_drop_black_and_unlit_pixels() {
 
 #[test]
 fn turned_photos_follow_the_size_of_their_camera_in_every_format() {
-    let transforms = |folder: &Path, [w, h]: [usize; 2]| {
+    let write_transforms = |folder: &Path, [w, h]: [usize; 2], centre: Option<[f64; 2]>| {
         let pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4]];
         let frames = serde_json::json!([{ "file_path": "images/0.jpg", "transform_matrix": pose }]);
         let mut document = serde_json::json!({ "fl_x": 20, "frames": frames });
         if w > 0 {
             (document["w"], document["h"]) = (w.into(), h.into());
         }
+        if let Some([x, y]) = centre {
+            (document["cx"], document["cy"]) = (x.into(), y.into());
+        }
         std::fs::write(folder.join("transforms.json"), document.to_string()).unwrap();
     };
+    let transforms = |folder: &Path, size: [usize; 2]| write_transforms(folder, size, None);
     let capture = |folder: &Path, [w, h]: [usize; 2], format: Format| {
         let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::ZERO, DVec3::Z);
         let image = Some(folder.join("images/0.jpg"));
@@ -270,6 +274,21 @@ fn turned_photos_follow_the_size_of_their_camera_in_every_format() {
             let plan = Plan::new(&capture, &capture.views[0], LoadOptions::default()).unwrap();
             assert_eq!([plan.size, [w, h]], [if corner == 0 { [16, 8] } else { [8, 16] }; 2]);
         }
+    }
+    // Without a size, the principal point decides.
+    for (centre, size, notes) in
+        [([4.0, 8.0], [8, 16], 0), ([4.6, 6.9], [8, 16], 0), ([8.1, 3.8], [16, 8], 0), ([6.0, 6.0], [16, 8], 1)]
+    {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("images")).unwrap();
+        std::fs::write(folder.path().join("images/0.jpg"), crate::dataset::photo::tests::jpeg(6)).unwrap();
+        write_transforms(folder.path(), [0, 0], Some(centre));
+        let capture = Capture::read(folder.path()).unwrap();
+        let camera = &capture.views[0].camera;
+        assert_eq!(([camera.width, camera.height], camera.centre), (size, centre));
+        assert_eq!(capture.assumptions.len(), notes, "{centre:?}");
+        let photo = capture.photo(&capture.views[0]).unwrap();
+        assert_eq!([photo.width, photo.height], size);
     }
 }
 
