@@ -132,9 +132,14 @@ impl Frames {
         }
         self.assumptions.extend(contradicting);
         if let Some(first) = unclear.first() {
-            let (count, first) = (unclear.len(), first.strip_prefix(folder).unwrap_or(first).display());
+            let first = first.strip_prefix(folder).unwrap_or(first).display();
+            // Of Blender's images, a single header is read.
+            let count = match dialect {
+                Dialect::Transforms => format!("{} ", unclear.len()),
+                Dialect::Blender => String::new(),
+            };
             self.assumptions.push(format!(
-                "{count} images have an EXIF orientation but no `w` and `h`, such as `{first}`: used their pixels as \
+                "{count}images have an EXIF orientation but no `w` and `h`, such as `{first}`: used their pixels as \
                  stored; give the width and height of the turned images to turn them"
             ));
         }

@@ -298,3 +298,16 @@ fn files_of_held_out_images_may_be_broken_if_their_splits_are_not_needed() {
     std::fs::rename(&test, file_of(folder.path(), Split::Train)).unwrap();
     says(&failure(Capture::read_unsplit(folder.path(), None, None), "transforms_train.json"), &["is not valid JSON"]);
 }
+
+#[test]
+fn turned_images_are_not_counted_by_a_single_header() {
+    let folder = tempfile::tempdir().unwrap();
+    let document = json!({ "camera_angle_x": 0.8, "frames": frames(&["a", "b"]) });
+    std::fs::write(file_of(folder.path(), Split::Train), document.to_string()).unwrap();
+    for name in ["a.jpg", "b.jpg"] {
+        std::fs::write(folder.path().join(name), crate::dataset::photo::tests::jpeg(6)).unwrap();
+    }
+    let notes = read(folder.path()).unwrap().assumptions;
+    let expected = "images have an EXIF orientation but no `w` and `h`, such as `a.jpg`: ";
+    assert!(matches!(&notes[..], [note] if note.starts_with(expected)), "{notes:?}");
+}
