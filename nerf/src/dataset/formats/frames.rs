@@ -4,7 +4,7 @@ use super::intrinsics::check_known;
 use super::json::Object;
 use super::layers::Layers;
 use super::locate::{Located, locate};
-use super::{matrix, paths};
+use super::{masks, matrix, paths};
 use crate::dataset::capture::View;
 use crate::dataset::photo::Photo;
 use crate::error::{Error, Result};
@@ -75,7 +75,7 @@ impl Frames {
             out.assumptions.push(format!("left out {count} of {total} frames without a finite pose, such as `{name}`"));
         }
         out.assumptions.extend(moving(&all));
-        out.assumptions.extend(attach_dynamic_masks(out.views.iter_mut().flatten()));
+        out.assumptions.extend(masks::attach_dynamic(&mut out.views.iter_mut().flatten().collect::<Vec<_>>()));
         Ok(out)
     }
 
@@ -153,29 +153,6 @@ fn moving(frames: &[&Object<'_>]) -> Option<String> {
     let first = times.next()?;
     let what = "frames have different times (`time`); all are trained as one still scene, so what moves is blurred";
     times.any(|time| time != first).then(|| what.to_owned())
-}
-
-/// Sets instant-ngp's masks of moving objects, which stand beside images, where a view has no other. Returns a note.
-fn attach_dynamic_masks<'a>(views: impl Iterator<Item = &'a mut View>) -> Option<String> {
-    let (mut first, mut count, mut present) = (None, 0, 0);
-    for view in views {
-        let Some(image) = &view.image else { continue };
-        present += 1;
-        let Some(stem) = image.file_stem().and_then(|stem| stem.to_str()).filter(|_| view.mask.is_none()) else {
-            continue;
-        };
-        let name = format!("dynamic_mask_{stem}.png");
-        let mask = image.with_file_name(&name);
-        if mask.is_file() {
-            (view.mask, view.mask_is_dynamic) = (Some(mask), true);
-            first.get_or_insert(name);
-            count += 1;
-        }
-    }
-    Some(format!(
-        "{count} of {present} images have a dynamic mask of instant-ngp, such as `{}`: used only its black pixels",
-        first?
-    ))
 }
 
 /// A listed path and its file, if it exists.

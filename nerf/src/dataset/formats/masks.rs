@@ -1,8 +1,9 @@
-//! Masks in a folder beside the images.
+//! Masks in a folder beside the images, and dynamic masks among them.
 
-use super::paths::folded;
-use crate::dataset::capture::Capture;
-use std::collections::HashMap;
+use super::locate::stem;
+use super::paths::{extension, folded};
+use crate::dataset::capture::{Capture, View};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 /// Names of mask folders.
@@ -31,6 +32,75 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) {
     }
 }
 
+/// The start of the names of instant-ngp's dynamic masks.
+const DYNAMIC: &str = "dynamic_mask_";
+
+/// Sets instant-ngp's masks of moving objects, which stand beside images, where a view has no other. Returns notes on
+/// them, and on those that fit no image.
+pub(super) fn attach_dynamic(views: &mut [&mut View]) -> Vec<String> {
+    let of = |image: &PathBuf| Some(image.with_file_name(format!("{DYNAMIC}{}.png", image.file_stem()?.to_str()?)));
+    let images: Vec<PathBuf> = views.iter().filter_map(|view| view.image.clone()).collect();
+    let unused = unused(views, &images);
+    // A name that differs in case may be that of another image's mask.
+    let exact: HashSet<PathBuf> = images.iter().filter_map(of).collect();
+    let (mut listings, mut first, mut count) = (HashMap::new(), None, 0);
+    for view in views.iter_mut().filter(|view| view.mask.is_none()) {
+        let Some(path) = view.image.as_ref().and_then(of) else { continue };
+        let mut other = |path: &Path| in_any_case(&mut listings, path).filter(|mask| !exact.contains(mask));
+        let Some(mask) = (if path.is_file() { Some(path) } else { other(&path) }) else { continue };
+        first.get_or_insert_with(|| mask.clone());
+        (view.mask, view.mask_is_dynamic) = (Some(mask), true);
+        count += 1;
+    }
+    let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let used = first.iter().map(|first| {
+        let (first, present) = (name(first), images.len());
+        format!(
+            "{count} of {present} images have a dynamic mask of instant-ngp, such as `{first}`: used only its black pixels"
+        )
+    });
+    let unused = unused.first().map(|first| {
+        let (first, count) = (name(first), unused.len());
+        format!(
+            "{count} dynamic masks fit no image, such as `{first}`: name that of `NAME.jpg` `{DYNAMIC}NAME.png` to use it"
+        )
+    });
+    used.chain(unused).collect()
+}
+
+/// The dynamic masks in the folders of `images` that fit neither an image there nor an absent one.
+fn unused(views: &[&mut View], images: &[PathBuf]) -> BTreeSet<PathBuf> {
+    let absent: HashSet<String> = views
+        .iter()
+        .filter(|view| view.image.is_none())
+        .map(|view| stem(view.name.rsplit('/').next().unwrap_or_default()))
+        .collect();
+    let masks = views.iter().filter_map(|view| view.mask.as_ref());
+    let depths = views.iter().filter_map(|view| Some(&view.depth.as_ref()?.0));
+    let listed: HashSet<&PathBuf> = images.iter().chain(masks).chain(depths).collect();
+    let folders: BTreeSet<&Path> = images.iter().filter_map(|image| image.parent()).collect();
+    let mut out = BTreeSet::new();
+    for folder in folders {
+        let files: Vec<PathBuf> = files(folder).collect();
+        let name = |path: &PathBuf| Some(folded(path.file_name()?.to_str()?));
+        let stems: HashSet<String> = files.iter().filter_map(name).map(|name| stem(&name)).collect();
+        let is_unused = |file: &PathBuf| {
+            let Some(name) = name(file).filter(|name| extension(name).is_some()) else { return false };
+            let Some(of) = name.strip_prefix(DYNAMIC) else { return false };
+            let fits = |of: &str| stems.contains(of) || absent.contains(of);
+            !listed.contains(file) && !of.strip_suffix(".png").is_some_and(fits)
+        };
+        out.extend(files.iter().filter(|file| is_unused(file)).cloned());
+    }
+    out
+}
+
+/// The files of a folder.
+fn files(folder: &Path) -> impl Iterator<Item = PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    entries.filter(|path| path.is_file())
+}
+
 /// The files of each folder, by folded name.
 type Listings = HashMap<PathBuf, HashMap<String, PathBuf>>;
 
@@ -39,8 +109,7 @@ fn in_any_case(listings: &mut Listings, path: &Path) -> Option<PathBuf> {
     let lower = |path: &Path| Some(folded(path.file_name()?.to_str()?));
     let folder = path.parent()?;
     let listing = listings.entry(folder.to_owned()).or_insert_with(|| {
-        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-        let mut files: Vec<PathBuf> = entries.filter(|path| path.is_file()).collect();
+        let mut files: Vec<PathBuf> = files(folder).collect();
         files.sort();
         files.into_iter().filter_map(|path| Some((lower(&path)?, path))).collect()
     });
@@ -62,6 +131,57 @@ mod tests {
             picture(&mask, 8, 6);
             attach(&mut capture, &[folder.path().to_owned()]);
             assert_eq!((capture.views[0].mask.as_ref(), capture.assumptions.len()), (Some(&mask), 0), "{name}");
+        }
+    }
+
+    /// The file name of each view's dynamic mask, and the notes, of images and masks with these names.
+    fn dynamic(images: &[&str], absent: &[&str], masks: &[&str]) -> (Vec<Option<String>>, Vec<String>) {
+        let folder = tempfile::tempdir().unwrap();
+        let mut view = picture_with_camera(folder.path()).views.remove(0);
+        let at = |name: &&str| folder.path().join("images").join(name);
+        images.iter().chain(masks).for_each(|name| picture(&at(name), 8, 6));
+        let mut named = |name: &&str, image| {
+            (view.name, view.image) = (format!("images/{name}"), image);
+            view.clone()
+        };
+        let mut views: Vec<View> = images.iter().map(|name| named(name, Some(at(name)))).collect();
+        views.extend(absent.iter().map(|name| named(name, None)));
+        let notes = attach_dynamic(&mut views.iter_mut().collect::<Vec<_>>());
+        assert!(views.iter().all(|view| view.mask_is_dynamic == view.mask.is_some()));
+        let name = |path: PathBuf| path.file_name().unwrap().to_str().unwrap().to_owned();
+        (views.into_iter().map(|view| view.mask.map(name)).collect(), notes)
+    }
+
+    #[test]
+    fn dynamic_masks_match_in_any_case_and_unicode_normal_form() {
+        for (image, mask) in [
+            ("A.png", "dynamic_mask_a.PNG"),
+            ("a.jpg", "Dynamic_Mask_A.png"),
+            ("Caf\u{e9}.jpg", "dynamic_mask_cafe\u{301}.png"),
+        ] {
+            let (found, notes) = dynamic(&[image], &[], &[mask]);
+            assert_eq!(found, [Some(mask.to_owned())], "{image}");
+            let expected = format!("1 of 1 images have a dynamic mask of instant-ngp, such as `{mask}`: ");
+            assert!(matches!(&notes[..], [note] if note.starts_with(&expected)), "{notes:?}");
+        }
+        // Another image's mask is not taken.
+        let (found, _) = dynamic(&["a.jpg", "A.png"], &[], &["dynamic_mask_A.png"]);
+        assert_eq!(found, [None, Some("dynamic_mask_A.png".to_owned())]);
+    }
+
+    #[test]
+    fn dynamic_masks_without_an_image_are_noted() {
+        let note = |count: usize, first: &str| {
+            let rest = "name that of `NAME.jpg` `dynamic_mask_NAME.png` to use it";
+            vec![format!("{count} dynamic masks fit no image, such as `{first}`: {rest}")]
+        };
+        let wrong = ["dynamic_mask_a.jpg.png", "dynamic_mask_b.webp.png", "Dynamic_mask_9.png"];
+        for (masks, expected) in [
+            (&wrong[..], note(3, "Dynamic_mask_9.png")),
+            (&["dynamic_mask_a.jpg"], note(1, "dynamic_mask_a.jpg")),
+            (&["dynamic_mask_b.png", "mask_c.png"], vec![]),
+        ] {
+            assert_eq!(dynamic(&["a.jpg"], &["b.jpg"], masks), (vec![None; 2], expected), "{masks:?}");
         }
     }
 }
