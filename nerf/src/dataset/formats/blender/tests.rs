@@ -294,6 +294,11 @@ fn files_of_held_out_images_may_be_broken_if_their_splits_are_not_needed() {
     assert_eq!(capture.views.len(), 2);
     assert!(matches!(&capture.assumptions[..], [note] if note.starts_with("left out the frames of ")
         && note.contains("transforms_test.json: is not valid JSON")));
+    // Fields count, also those of held-out images.
+    std::fs::write(&test, "{}").unwrap();
+    let message = failure(Capture::read_unsplit(folder.path(), None, None), "transforms_test.json");
+    says(&message, &["`frames`: is missing"]);
+    std::fs::write(&test, "{").unwrap();
     // Training images are needed.
     std::fs::rename(&test, file_of(folder.path(), Split::Train)).unwrap();
     says(&failure(Capture::read_unsplit(folder.path(), None, None), "transforms_train.json"), &["is not valid JSON"]);
