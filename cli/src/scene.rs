@@ -281,7 +281,8 @@ mod tests {
         std::fs::write(folder.path().join("transforms.json"), transforms.to_string()).unwrap();
         let scene = Scene::Folder(folder.path().to_owned());
         let message = scene.open(None, false, None, None).err().unwrap().to_string();
-        assert!(message.contains("has too: remove it from one of them, or choose the test images with `train --test`"));
+        let remedy = "has too: remove it from one of them; `raygrad train --test` chooses other test images";
+        assert!(message.ends_with(remedy), "{message}");
         let description = scene.description(Format::Transforms).unwrap();
         for description in [None, description.as_deref()] {
             let opened = scene.open(None, false, Some(&HoldOut::Every(2)), description).unwrap();

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 /// A remedy for wrong splits.
-pub(super) const CHOOSE: &str = "or choose the test images with `train --test`";
+pub(super) const CHOOSE: &str = "`raygrad train --test` chooses other test images";
 
 /// The images that are held out as [test](Split::Test) images; all others are trained on.
 ///

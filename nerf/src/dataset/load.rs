@@ -175,7 +175,7 @@ impl Capture {
         for view in self.present().filter(|view| view.split != Some(Split::Train)) {
             if let Some(other) = view.image.as_ref().and_then(|image| trained.get(image)) {
                 let what = format!(
-                    "`{}` is held out, but its image is trained on as {}: remove one of them, {CHOOSE}",
+                    "`{}` is held out, but its image is trained on as {}: remove one of them; {CHOOSE}",
                     view.name, other.field
                 );
                 return Err(Error::field(&self.file, &view.field, what));

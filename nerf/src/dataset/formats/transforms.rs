@@ -87,13 +87,13 @@ fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>)
                 if left_out.contains(&name) {
                     continue;
                 }
-                let what = format!("lists {name}, but no frame has this file_path: remove it, {CHOOSE}");
+                let what = format!("lists {name}, but no frame has this file_path: remove it; {CHOOSE}");
                 return Err(top.error(&field, what));
             };
             for &place in places {
                 if split != Split::Train && splits[place] == Some(Split::Train) {
                     let what =
-                        format!("lists {name}, which train_filenames has too: remove it from one of them, {CHOOSE}");
+                        format!("lists {name}, which train_filenames has too: remove it from one of them; {CHOOSE}");
                     return Err(top.error(&field, what));
                 }
                 splits[place] = Some(split);
