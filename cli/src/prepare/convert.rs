@@ -319,15 +319,19 @@ fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
     print(&format!("scene    {}: {}\n", out.display(), parts.join(", ")))
 }
 
-/// Warnings about masks, depth files and splits that the new dataset does not have.
+/// Warnings about masks, depth files and splits that the new dataset does not have, or only for some programs.
 fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
     let count = |has: fn(&View) -> bool| capture.views.iter().filter(|view| has(view)).count();
     let masks = count(|view| view.mask.is_some());
+    let dynamic = count(|view| view.mask_is_dynamic);
     let depths = count(|view| view.depth.is_some());
     let held_out = count(|view| view.split.is_some_and(|split| split != Split::Train));
     let mut warnings = vec![];
     if masks > 0 && !target.has_masks() {
         warnings.push(format!("{masks} masks are not converted: LLFF has none"));
+    }
+    if dynamic > 0 && target == Target::Nerfstudio {
+        warnings.push(format!("{dynamic} dynamic masks become a `mask_path`, which instant-ngp does not read"));
     }
     if depths > 0 && !target.has_depths() {
         warnings.push(format!("{depths} depth files are not converted: the format has none"));
@@ -545,6 +549,14 @@ mod tests {
             };
             assert_eq!(lost(&capture, target, true), undistorted, "{target:?} undistorted");
         }
+        let mut dynamic = View { mask_is_dynamic: true, mask: Some("dynamic_mask_0.png".into()), ..view(None) };
+        let mut capture = Capture { views: vec![dynamic.clone(), view(None)], ..capture };
+        let warning = "1 dynamic masks become a `mask_path`, which instant-ngp does not read";
+        assert_eq!(lost(&capture, Target::Nerfstudio, false), [warning]);
+        assert_eq!(lost(&capture, Target::Colmap, false), [""; 0]);
+        dynamic.mask_is_dynamic = false;
+        capture.views[0] = dynamic;
+        assert_eq!(lost(&capture, Target::Nerfstudio, false), [""; 0]);
         let capture = Capture { views: vec![view(Some(Split::Train)), view(None)], ..capture };
         assert_eq!(lost(&capture, Target::Llff, false), Vec::<String>::new());
     }
