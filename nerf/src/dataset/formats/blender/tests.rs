@@ -282,7 +282,10 @@ fn files_of_held_out_images_may_be_broken_if_their_splits_are_not_needed() {
     // The same image in two splits.
     std::fs::write(&test, document.to_string()).unwrap();
     let message = failure(Capture::read(folder.path()), "transforms_train.json");
-    says(&message, &["`a` is held out, but its image is trained on", "remove one of them; `raygrad train --test` chooses other"]);
+    says(
+        &message,
+        &["`a` is held out, but its image is trained on", "remove one of them; `raygrad train --test` chooses other"],
+    );
     let mut capture = Capture::read_unsplit(folder.path(), None, None).unwrap();
     assert!(capture.views.len() == 4 && capture.views.iter().all(|view| view.split.is_none()));
     capture.hold_out(&HoldOut::Images(vec!["a".into()])).unwrap();
