@@ -137,11 +137,7 @@ impl Conversion {
         if out.symlink_metadata().is_ok() {
             return Err(Error::file(out, "exists: choose another --out, or leave out --shard").into());
         }
-        let view = |view: &View| {
-            let has = [view.image.is_some(), view.mask.is_some(), view.depth.is_some()];
-            json!((&view.name, &view.camera, view.split, has)).to_string()
-        };
-        let views: String = self.capture.views.iter().map(view).collect();
+        let views: String = self.capture.views.iter().map(recorded).collect();
         let inputs = json!({
             "raygrad": env!("CARGO_PKG_VERSION"),
             "input": source(&self.capture).to_string_lossy(),
@@ -219,6 +215,12 @@ impl Conversion {
         }
         Ok(jobs)
     }
+}
+
+/// What the record of a shard holds of a view.
+fn recorded(view: &View) -> String {
+    let has = [view.image.is_some(), view.mask.is_some(), view.mask_is_dynamic, view.depth.is_some()];
+    json!((&view.name, &view.camera, view.split, has)).to_string()
 }
 
 /// The name of the command in records.
@@ -495,6 +497,15 @@ mod tests {
         ] {
             assert_eq!(of(target, rest), pair(image, name), "{rest} {target:?}");
         }
+    }
+
+    #[test]
+    fn records_of_shards_tell_kinds_of_masks_apart() {
+        let view = View::new("0.png", "frames[0]", Camera::from_angle(4, 3, 1.0, DAffine3::IDENTITY));
+        let masked = View { mask: Some("0.png.png".into()), ..view.clone() };
+        let dynamic = View { mask_is_dynamic: true, ..masked.clone() };
+        let distinct: HashSet<String> = [view, masked, dynamic].iter().map(recorded).collect();
+        assert_eq!(distinct.len(), 3);
     }
 
     #[test]
