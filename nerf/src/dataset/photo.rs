@@ -481,4 +481,4 @@ fn chunks_fit(reader: &mut (impl Read + Seek), length: u64) -> std::io::Result<b
 }
 
 #[cfg(test)]
-pub(super) mod tests;
+pub(crate) mod tests;

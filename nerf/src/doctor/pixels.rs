@@ -32,8 +32,10 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
     let (mut masks, mut first_mask) = (vec![], String::new());
     for view in capture.present() {
         let Some(Ok([stored, shown])) = view.image.as_ref().map(Photo::size_of_file) else { continue };
-        *counts.entry(shown).or_default() += 1;
-        if view.camera.width > 0 && !same_shape(stored, &view.camera) && !same_shape(shown, &view.camera) {
+        // As stored if that fits the camera, otherwise as shown.
+        let used = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera));
+        *counts.entry(used.unwrap_or(shown)).or_default() += 1;
+        if view.camera.width > 0 && used.is_none() {
             if shapes.is_empty() {
                 let [w, h] = shown;
                 first = format!("{w}x{h} pixels, the camera has {}x{}", view.camera.width, view.camera.height);
@@ -203,6 +205,29 @@ mod tests {
         let [found] = &findings.sorted()[..] else { panic!("not one finding") };
         assert_eq!((found.kind, &found.views[..]), (Kind::MaskShape, &["2".to_owned(), "3".to_owned()][..]));
         assert!(found.what.ends_with("of 2 images: 8x8 pixels, the image has 8x6"), "{}", found.what);
+    }
+
+    #[test]
+    fn sizes_are_those_that_the_cameras_have() {
+        let folder = tempfile::tempdir().unwrap();
+        let view = |(orientation, [width, height]): (u8, [usize; 2])| {
+            let path = folder.path().join(format!("{orientation}-{width}.jpg"));
+            std::fs::write(&path, crate::dataset::photo::tests::jpeg(orientation)).unwrap();
+            let camera = Camera::from_angle(width, height, 0.7, DAffine3::IDENTITY);
+            View { image: Some(path), ..View::new(format!("{orientation} {width}"), "", camera) }
+        };
+        for (images, sizes_found, findings_found) in [
+            ([(1, [16, 8]), (6, [16, 8])], vec![([16, 8], 2)], vec![]),
+            ([(6, [8, 16]), (8, [8, 16])], vec![([8, 16], 2)], vec![]),
+            ([(6, [8, 16]), (6, [16, 8])], vec![([8, 16], 1), ([16, 8], 1)], vec![Kind::MixedResolutions]),
+        ] {
+            let views = images.map(view).into();
+            let capture = Capture::new(folder.path(), "transforms.json".into(), Format::Transforms, views);
+            let mut findings = Findings::default();
+            assert_eq!(sizes(&capture, &mut findings), sizes_found, "{images:?}");
+            let kinds: Vec<Kind> = findings.sorted().iter().map(|finding| finding.kind).collect();
+            assert_eq!(kinds, findings_found, "{images:?}");
+        }
     }
 
     #[test]

@@ -61,7 +61,7 @@ fn resizing_does_not_enlarge() {
 }
 
 /// A JPEG of 16 x 8 pixels with this EXIF orientation. Its upper left quarter is white.
-pub(in crate::dataset) fn jpeg(orientation: u8) -> Vec<u8> {
+pub(crate) fn jpeg(orientation: u8) -> Vec<u8> {
     let mut plain = vec![];
     let picture = image::RgbImage::from_fn(16, 8, |x, y| image::Rgb([if x < 8 && y < 4 { 255 } else { 0 }; 3]));
     picture.write_to(&mut Cursor::new(&mut plain), ImageFormat::Jpeg).unwrap();
