@@ -49,7 +49,7 @@ fn modules(root: &Path) -> BTreeMap<Vec<String>, PathBuf> {
             let mut module: Vec<String> = name.iter().map(|part| part.to_str().unwrap().to_owned()).collect();
             if path.is_dir() {
                 folders.push(path);
-            } else if module.last().unwrap() != "tests"
+            } else if !module.iter().any(|part| part == "tests")
                 && !GATHERING.contains(&path.file_name().unwrap().to_str().unwrap())
             {
                 module.pop_if(|last| last == "mod");
