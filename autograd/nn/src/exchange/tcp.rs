@@ -296,6 +296,20 @@ mod tests {
     }
 
     #[test]
+    fn messages_that_end_early_are_lost() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let addresses = [listener.local_addr().unwrap(); 2];
+        // It promises 100 bytes, and ends after 3.
+        let mut peer = TcpStream::connect(addresses[0]).unwrap();
+        peer.write_all(&greeting(1, 2)).unwrap();
+        peer.write_all(&[100, 0, 0, 0, 0, 0, 0, 0, 1, 2, 3]).unwrap();
+        peer.shutdown(std::net::Shutdown::Write).unwrap();
+        let mut tcp = Tcp::with_listener(0, listener, &addresses, TIMEOUT).unwrap();
+        let what = "it has closed its connection".to_owned();
+        assert_eq!(tcp.all_gather(&[]), Err(ExchangeError::Lost { rank: 1, what }));
+    }
+
+    #[test]
     fn absent_ranks_are_named() {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap();
