@@ -58,11 +58,11 @@ fn relay(mut from: TcpStream, mut to: TcpStream, [out, into]: [Lane; 2], link: L
     });
 }
 
-/// The rank that calls, which it says first. The relay hands it on.
-fn caller(stream: &mut TcpStream) -> u64 {
-    let mut rank = [0; 8];
-    stream.read_exact(&mut rank).unwrap();
-    u64::from_le_bytes(rank)
+/// What a rank that calls says first, and its number in there.
+fn caller(stream: &mut TcpStream) -> ([u8; 24], usize) {
+    let mut greeting = [0; 24];
+    stream.read_exact(&mut greeting).unwrap();
+    (greeting, u64::from_le_bytes(greeting[8..16].try_into().unwrap()) as usize)
 }
 
 /// Relays all connections to a rank.
@@ -75,9 +75,8 @@ fn relay_to(rank: usize, address: SocketAddr, lanes: Arc<Vec<[Lane; 2]>>, link: 
             let mut outgoing = TcpStream::connect(address).unwrap();
             incoming.set_nodelay(true).unwrap();
             outgoing.set_nodelay(true).unwrap();
-            let other = caller(&mut incoming);
-            outgoing.write_all(&other.to_le_bytes()).unwrap();
-            let other = other as usize;
+            let (greeting, other) = caller(&mut incoming);
+            outgoing.write_all(&greeting).unwrap();
             let [there, back] = [(other, rank), (rank, other)].map(|(a, b)| [lanes[a][0].clone(), lanes[b][1].clone()]);
             relay(incoming.try_clone().unwrap(), outgoing.try_clone().unwrap(), there, link);
             relay(outgoing, incoming, back, link);
