@@ -61,7 +61,7 @@ fn fit(truth: &Image, levels: usize) -> Image {
     let mut adam = Adam::new(AdamConfig::default());
     let schedule = Schedule::Exponential { from: 5e-3, to: 5e-4, warmup: 0.02 };
     // A step in tiles, which keep all cores busy and their caches warm.
-    let mut tiles = Tiles::<f32>::new();
+    let tiles = Tiles::<f32>::new();
     for step in 0..STEPS {
         let pixels: Vec<_> = (0..BATCH).map(|_| rng.random_range(0..truth.width * truth.height)).collect();
         let sums = tiles.differentiate(&params, BATCH / TILE, |tile, params, _| {
@@ -75,7 +75,6 @@ fn fit(truth: &Image, levels: usize) -> Image {
         adam.update(&mut params, &sums.grads, schedule.lr(step as f64 / STEPS as f64))
             .check()
             .expect("finite gradients");
-        tiles.take_back(sums.grads);
         if step % (STEPS / 4) == 0 {
             println!("  step {step:4}: {:.2} dB on its pixels", metrics::psnr_from_mse(sums.results.iter().sum()));
         }

@@ -43,7 +43,7 @@ fn train(exchange: &mut dyn Exchange) -> Result<f64, ExchangeError> {
     let network = (trunk, head);
     let mut adam = Adam::new(AdamConfig::default());
     let schedule = Schedule::Cosine { from: 1e-2, to: 0.0, warmup: 0.05 };
-    let mut tiles = Tiles::<f32>::new();
+    let tiles = Tiles::<f32>::new();
     let mut last = f64::NAN;
     for step in 0..STEPS {
         let sums =
@@ -51,7 +51,6 @@ fn train(exchange: &mut dyn Exchange) -> Result<f64, ExchangeError> {
         adam.update(&mut params, &sums.grads, schedule.at_step(step as u64, STEPS as u64))
             .check()
             .expect("finite gradients");
-        tiles.take_back(sums.grads);
         last = sums.results.iter().sum();
         if exchange.rank() == 0 && (step + 1) % (STEPS / 4) == 0 {
             println!("step {:3}  mean squared error {last}", step + 1);

@@ -24,7 +24,8 @@ pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
     let model = &trainer.model;
     let cells = model.sampler.grid().map_or(0, |grid| grid.cells());
     let samples = match model.sampler.batch_size() {
-        BatchSize::Samples(samples) => samples,
+        // Tapes hold as many tiles as threads work: as measured with 8 tiles in a step.
+        size @ BatchSize::Samples(samples) => 8 * samples / size.tile_count(),
         // The tape of a few rays is negligible.
         BatchSize::Rays { .. } => 0,
     };

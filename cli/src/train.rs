@@ -40,11 +40,12 @@ const RETREATS: u32 = 3;
 const FINISHED: &str = ", the end of its budget: add --steps or --budget with a larger total to train on";
 
 /// Options of new runs only.
-const NEW: [&str; 18] = [
+const NEW: [&str; 19] = [
     "scene",
     "preset",
     "skip",
     "carve",
+    "batch_scale",
     "seed",
     "downscale",
     "format",
@@ -109,6 +110,13 @@ pub struct Args {
     /// The same seed and number of steps give the same model, bit for bit.
     #[arg(long, help_heading = "Time", value_name = "N", value_parser = parse::within(1u64..))]
     steps: Option<u64>,
+    /// Enlarge training steps N times
+    ///
+    /// Larger steps keep more cores busy, of all machines together; `train` prints a note where it could help. The
+    /// samples or rays of a step, also if --set changes them, become N times as many, and learning rates grow by the
+    /// square root of N. Range: 1 to 64.
+    #[arg(long, help_heading = "Advanced", value_name = "N", default_value_t = 1, value_parser = parse::count(config::MOST_BATCH_SCALE))]
+    batch_scale: usize,
     /// Random seed
     #[arg(long, help_heading = "Advanced", value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -301,6 +309,9 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     describe(&run, &trainer, &data, &scene)?;
     // Warnings come after all checks, so that an error is the only line of output.
     doctor::warn(&scene);
+    if let Some(note) = args.idle_cores(trainer.model.sampler.batch_size()) {
+        complain(&note);
+    }
     if let Some(limit) = limit {
         let [width, height] = [data.frames[0].image.width, data.frames[0].image.height];
         let limit = match limit {

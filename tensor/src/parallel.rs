@@ -76,6 +76,15 @@ pub fn each_of<P: Send>(parts: impl IntoIterator<Item = P>, f: impl Fn(usize, P)
     });
 }
 
+/// Calls both, at the same time if another thread is free, or within [`serial`] one after the other on this thread.
+///
+/// ```
+/// assert_eq!(raygrad_tensor::parallel::join(|| 1, || "two"), (1, "two"));
+/// ```
+pub fn join<A: Send, B: Send>(a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
+    if SERIAL.get() { (a(), b()) } else { rayon::join(a, b) }
+}
+
 /// As [`each`], and collects the results in order.
 ///
 /// ```
@@ -356,6 +365,17 @@ mod tests {
         let (own, alone, together) = pool.install(|| (rayon::current_thread_index(), serial(threads), threads()));
         assert_eq!(alone, [own; 64]);
         assert!(together.iter().any(|thread| *thread != own));
+    }
+
+    #[test]
+    fn join_uses_an_idle_thread_unless_it_is_serial() {
+        let thread = || {
+            std::thread::sleep(std::time::Duration::from_millis(20));
+            rayon::current_thread_index()
+        };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+        let (together, alone) = pool.install(|| (super::join(thread, thread), serial(|| super::join(thread, thread))));
+        assert!(together.0 != together.1 && alone.0 == alone.1, "{together:?} {alone:?}");
     }
 
     #[test]

@@ -59,4 +59,4 @@ pub use optim::{SettingError, Sgd, SgdConfig, StateError, UpdateReport, clip_nor
 pub use params::{Bound, ParamId, ParamLayout, Params};
 #[cfg(feature = "files")]
 pub use storage::{ParamsError, Storage, stored_bytes, stored_words};
-pub use tiles::{SLOTS, TileSums, Tiles};
+pub use tiles::{TileSums, Tiles};

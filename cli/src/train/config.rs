@@ -6,8 +6,7 @@ use raygrad::nerf::dataset::{Dataset, SceneType};
 use raygrad::nerf::losses::DepthConfig;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
-use raygrad::nerf::{Budget, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
-use raygrad::nn::SLOTS;
+use raygrad::nerf::{BatchSize, Budget, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
 use serde_json::Value;
 
 use super::super::cameras::Viewpoint;
@@ -15,6 +14,9 @@ use super::super::ranks;
 use super::super::run::{RunConfig, usual_checkpoints};
 use super::super::scene::{Opened, Scene};
 use super::Args;
+
+/// The largest batch scale.
+pub const MOST_BATCH_SCALE: usize = 64;
 
 impl Args {
     /// The configuration of a new run.
@@ -52,6 +54,7 @@ impl Args {
             config = config.without_positional_encoding();
         }
         let config = self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))?;
+        let config = config.with_batch_scale(self.batch_scale);
         if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
             let what = "hierarchical sampling spaces samples evenly, too few for the long rays of an unbounded scene: \
                         use --preset instant or voxel, or add --skip fast or --scene-type bounded";
@@ -114,20 +117,27 @@ impl Args {
 
     /// Estimate of the samples along rays that fit in the budget, on all ranks.
     fn samples(&self) -> f64 {
-        let (ranks, threads) = (ranks::own().map_or(1, |(_, ranks)| ranks), rayon::current_num_threads());
-        match self.budget() {
-            // No more than one thread works for each slot.
-            Budget::Time(_) => {
-                self.budget().samples() * (ranks * threads).min(SLOTS) as f64 / threads.min(SLOTS) as f64
-            }
-            Budget::Steps(_) => self.budget().samples(),
-        }
+        self.budget().samples_on(cores(), self.batch_scale)
+    }
+
+    /// The note for steps of this size if steps of twice the size or more would take no longer.
+    pub fn idle_cores(&self, size: BatchSize) -> Option<String> {
+        let (cores, tiles) = (cores(), size.tile_count());
+        let scale = (self.batch_scale * size.scale_for(cores)).min(MOST_BATCH_SCALE);
+        (scale >= 2 * self.batch_scale).then(|| {
+            format!("note: a training step keeps {tiles} of {cores} cores busy; --batch-scale {scale} uses more")
+        })
     }
 
     /// The budget, if a flag sets it.
     pub fn given(&self) -> Option<Budget> {
         self.steps.map(Budget::Steps).or(self.budget.map(Budget::Time))
     }
+}
+
+/// The cores of all ranks.
+fn cores() -> usize {
+    ranks::own().map_or(1, |(_, ranks)| ranks) * rayon::current_num_threads()
 }
 
 /// Sets the near plane, given in capture units.
@@ -189,6 +199,7 @@ mod tests {
     use super::*;
     use clap::Parser;
     use raygrad::nerf::losses::DistortionConfig;
+    use raygrad::nerf::sampling::proposal::ProposalConfig;
 
     #[test]
     fn proposals_of_a_flag_get_their_distortion_weight() {
@@ -203,6 +214,42 @@ mod tests {
     }
 
     #[test]
+    fn batch_scale_grows_the_step_also_if_it_is_set() {
+        let data = raygrad_scenes::landscape(raygrad::nerf::dataset::Split::Test, 8);
+        let config = |flags: &str| {
+            Args::parse_from(format!("train --steps 100 {flags}").split_whitespace()).config(&data).unwrap()
+        };
+        let samples = |flags: &str| config(flags).sampler.get::<MarchingConfig>().unwrap().samples;
+        assert_eq!(samples("--batch-scale 2"), 2 * samples(""));
+        assert_eq!(samples("--batch-scale 2 --set sampler.samples=5000"), 10_000);
+        let proposal = config(r#"--batch-scale 3 --set sampler={"kind":"proposal"}"#).sampler;
+        assert_eq!(proposal.get::<ProposalConfig>().unwrap().batch, 3 * ProposalConfig::default().batch);
+    }
+
+    #[test]
+    fn idle_cores_are_noted() {
+        let note = |threads: usize, flags: &str, size: BatchSize| {
+            let args = Args::parse_from(format!("train {flags}").split_whitespace());
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| args.idle_cores(size))
+        };
+        let usual = BatchSize::Samples(24576);
+        // Of 15 cores, 16 tiles would keep 15 busy and then one.
+        assert_eq!([note(8, "", usual), note(15, "", usual)], [None, None]);
+        let expected = "note: a training step keeps 8 of 18 cores busy; --batch-scale 2 uses more";
+        assert_eq!(note(18, "", usual).as_deref(), Some(expected));
+        assert_eq!(note(16, "--batch-scale 2", BatchSize::Samples(49152)), None);
+        let expected = "note: a training step keeps 16 of 32 cores busy; --batch-scale 4 uses more";
+        assert_eq!(note(32, "--batch-scale 2", BatchSize::Samples(49152)).as_deref(), Some(expected));
+        // Small steps have small tiles.
+        let expected = "note: a training step keeps 8 of 18 cores busy; --batch-scale 13 uses more";
+        assert_eq!(note(18, "", BatchSize::Samples(4096)).as_deref(), Some(expected));
+        let expected = "note: a training step keeps 4 of 9 cores busy; --batch-scale 2 uses more";
+        assert_eq!(note(9, "", BatchSize::Rays { step: 64, tile: 16 }).as_deref(), Some(expected));
+        assert_eq!(note(30, "--batch-scale 40", BatchSize::Samples(24576)), None);
+    }
+
+    #[test]
     fn most_cells_follow_budget_and_flags() {
         let of = |scene_type, flags: &str| {
             Args::parse_from(format!("train {flags}").split_whitespace()).most_cells(scene_type).unwrap()
@@ -213,6 +260,7 @@ mod tests {
         assert_eq!(of(SceneType::Unbounded, "--steps 1000 --set field.grid.finest=2048"), 1024.0);
         assert_eq!(cells("--steps 1000"), 512.0);
         assert_eq!(cells("--steps 30000"), 768.0);
+        assert_eq!([cells("--steps 15000"), cells("--steps 15000 --batch-scale 2")], [512.0, 768.0]);
         assert_eq!(cells("--steps 1000 --set field.grid.finest=2048"), 2048.0);
         assert_eq!(cells("--preset voxel"), f64::INFINITY);
     }

@@ -338,6 +338,34 @@ impl Config {
         self
     }
 
+    /// Makes training steps `scale` times as large, which keeps more cores busy: large steps have more
+    /// [tiles](crate::BatchSize::tile_count). All learning rates grow by the square root of `scale`, as Malladi et al. 2022
+    /// derive for Adam ("On the SDEs and Scaling Rules for Adaptive Gradient Algorithms"; their rule for the moments'
+    /// constants is not applied). Samplers of other crates keep their size. Call it last. Figures are in
+    /// docs/benchmarks/results.md, section Large steps.
+    ///
+    /// # Panics
+    /// If `scale` is 0.
+    pub fn with_batch_scale(mut self, scale: usize) -> Self {
+        assert!(scale > 0, "a batch scale of 0; use 1 or more");
+        let sampler = &mut self.sampler;
+        let samples = sampler.get_mut::<MarchingConfig>().map(|marching| &mut marching.samples);
+        samples.into_iter().for_each(|size| *size = size.saturating_mul(scale));
+        let batch = sampler.get_mut::<HierarchicalConfig>().map(|hierarchical| &mut hierarchical.batch);
+        batch.into_iter().for_each(|size| *size = size.saturating_mul(scale));
+        let batch = sampler.get_mut::<ProposalConfig>().map(|proposal| &mut proposal.batch);
+        batch.into_iter().for_each(|size| *size = size.saturating_mul(scale));
+        let Config { schedule, groups, poses, camera_optimizer, exposure_model, .. } = &mut self;
+        let groups = groups.iter_mut().map(|group| &mut group.schedule);
+        let cameras = [&mut camera_optimizer.focal, &mut camera_optimizer.lens];
+        let exposure = [&mut exposure_model.exposure, &mut exposure_model.vignetting];
+        let others = [poses].into_iter().chain(cameras).chain(exposure).flatten();
+        for schedule in [schedule].into_iter().chain(groups).chain(others) {
+            *schedule = schedule.scaled((scale as f64).sqrt());
+        }
+        self
+    }
+
     /// Enables refinement of these camera parameters, at learning rates found with `examples/refine.rs`. With
     /// [`RefinedParam::Poses`], detail is enabled from coarse to fine, unless a
     /// [check](CameraOptimizerConfig::check_at) finds that the given poses are right.
@@ -504,6 +532,44 @@ mod tests {
         assert!(wrong.check().unwrap_err().to_string().starts_with("`exposure_model.vignetting.constant.lr`"));
         wrong.exposure_model = ExposureConfig { exposure: wrong.exposure_model.vignetting, vignetting: None };
         assert!(wrong.check().unwrap_err().to_string().starts_with("`exposure_model.exposure.constant.lr`"));
+    }
+
+    #[test]
+    fn batch_scale_grows_steps_and_learning_rates() {
+        let all = [
+            RefinedParam::Poses,
+            RefinedParam::Focal,
+            RefinedParam::Lens,
+            RefinedParam::Exposure,
+            RefinedParam::Vignetting,
+        ];
+        for preset in [Preset::Instant, Preset::Small, Preset::Voxel, Preset::Classic] {
+            let mut config = Config::preset(preset).with_refined(&all);
+            if preset == Preset::Voxel {
+                config.sampler = SamplerConfig::new(ProposalConfig::default());
+            }
+            let schedule = Schedule::Constant { lr: 0.1 };
+            let adam = AdamConfig::default();
+            config.groups = vec![GroupConfig { params: "field".into(), adam, schedule, weight_decay: 0.5 }];
+            assert_eq!(config.clone().with_batch_scale(1), config);
+            let scaled = config.clone().with_batch_scale(4);
+            scaled.check().unwrap();
+            let size = |config: &Config| {
+                let sampler = &config.sampler;
+                let samples = sampler.get::<MarchingConfig>().map(|marching| marching.samples);
+                let batch = sampler.get::<HierarchicalConfig>().map(|hierarchical| hierarchical.batch);
+                samples.or(batch).or_else(|| Some(sampler.get::<ProposalConfig>()?.batch)).unwrap()
+            };
+            assert_eq!(size(&scaled), 4 * size(&config), "{preset}");
+            let rates = |config: &Config| {
+                let cameras = ["poses", "focal", "lens", "exposure", "vignetting"];
+                let schedules = cameras.map(|name| config.camera_rate(name).unwrap());
+                let all = [config.schedule, config.groups[0].schedule].into_iter().chain(schedules);
+                all.map(|schedule| schedule.lr(0.5)).collect::<Vec<_>>()
+            };
+            let doubled = rates(&config).into_iter().map(|rate| 2.0 * rate);
+            assert!(rates(&scaled).into_iter().zip(doubled).all(|(rate, double)| (rate / double - 1.0).abs() < 1e-12));
+        }
     }
 
     #[test]

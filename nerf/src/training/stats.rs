@@ -1,7 +1,7 @@
 //! The training budget, and statistics of a step.
 
 use crate::model::PoseMotion;
-use raygrad_nn::SLOTS;
+use crate::sampling::TILES;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::time::Duration;
 
@@ -36,11 +36,17 @@ impl Budget {
     ///
     /// For steps it is the same on any machine; for a time it grows with the number of threads.
     pub fn samples(self) -> f64 {
+        self.samples_on(rayon::current_num_threads(), 1)
+    }
+
+    /// As [`samples`](Self::samples), on this number of cores of all machines, with steps that are larger by this
+    /// [scale](crate::Config::with_batch_scale). Of the cores as many count as a usual step of a bounded scene, so
+    /// enlarged, has tiles.
+    pub fn samples_on(self, cores: usize, batch_scale: usize) -> f64 {
         match self {
-            Budget::Steps(steps) => steps as f64 * SAMPLES_PER_STEP,
+            Budget::Steps(steps) => steps as f64 * SAMPLES_PER_STEP * batch_scale as f64,
             Budget::Time(time) => {
-                // A step has one part per slot, so more threads do not help.
-                time.as_secs_f64() * SAMPLES_PER_SECOND * rayon::current_num_threads().min(SLOTS) as f64
+                time.as_secs_f64() * SAMPLES_PER_SECOND * cores.min(TILES.saturating_mul(batch_scale)) as f64
             }
         }
     }
@@ -174,6 +180,12 @@ mod tests {
             assert_eq!((read(text).unwrap(), serde_json::to_string(&budget).unwrap()), (budget, text.to_owned()));
             assert_eq!(budget.samples(), samples);
         }
+        let minute = Budget::Time(Duration::from_secs(60));
+        assert_eq!(
+            [(4, 1), (12, 1), (12, 2)].map(|(cores, scale)| minute.samples_on(cores, scale)),
+            [2.4e8, 4.8e8, 7.2e8]
+        );
+        assert_eq!(Budget::Steps(10).samples_on(99, 3), 30.0 * 24576.0);
         assert!(read(r#"{"seconds":-1}"#).is_err() && read(r#"{"seconds":1e300}"#).is_err());
     }
 

@@ -17,13 +17,13 @@ use crate::sampling::{BatchSize, Progress};
 use crate::space::occupancy::Shares;
 use crate::{Error, Result};
 use raygrad_autograd::{Error as GraphError, Pool, Tape, Var};
-use raygrad_nn::{Bound, Exchange, ExchangeError, SLOTS, Tiles};
+use raygrad_nn::{Bound, Exchange, ExchangeError, Tiles};
 use std::ops::{Add, ControlFlow};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// The least and the most rays per step, if a number of samples is configured.
-const RAYS: [usize; 2] = [256, 1 << 16];
+/// The fewest rays per step, if a number of samples is configured.
+const FEWEST_RAYS: usize = 256;
 /// Steps between releases of unused memory: the number of samples changes during training.
 const TRIM_EVERY: u64 = 256;
 /// The fewest steps of a model, and rays of an image, after which poses are checked: they begin at 0 and need time to
@@ -75,7 +75,16 @@ struct Draw<'a> {
     tile: usize,
 }
 
-impl Draw<'_> {
+impl<'a> Draw<'a> {
+    fn new(model: &'a Model<f32>, data: &'a Dataset, seed: u64, number: u64, fraction: f64, total: usize) -> Self {
+        let size = model.sampler.batch_size();
+        let tile = match size {
+            BatchSize::Rays { tile, .. } => tile,
+            BatchSize::Samples(_) => total.div_ceil(size.tile_count()),
+        };
+        Draw { model, data, seed, number, fraction, total, tile }
+    }
+
     fn tiles(&self) -> usize {
         self.total.div_ceil(self.tile)
     }
@@ -147,7 +156,7 @@ impl Trainer {
             pool: Pool::new(),
             batch: match model.sampler.batch_size() {
                 BatchSize::Rays { step, .. } => step,
-                BatchSize::Samples(_) => RAYS[0],
+                BatchSize::Samples(_) => FEWEST_RAYS,
             },
             model,
             data,
@@ -277,26 +286,24 @@ impl Trainer {
         if self.exchange_error().is_some() {
             return self.done;
         }
-        let (mut tiles, mut across) = (std::mem::take(&mut self.tiles), self.across.take());
-        let draw = self.draw(fraction);
-        let number = draw.number;
-        let (params, count) = (&self.model.params, draw.tiles());
-        let step = match &mut across {
-            None => Ok(tiles.differentiate(params, count, |which, params, ()| draw.loss(which, params))),
-            Some(Across { exchange, .. }) => {
-                tiles.differentiate_across(&mut **exchange, params, count, |which, params, ()| draw.loss(which, params))
-            }
-        };
-        let step = match step {
-            Ok(step) => step,
-            Err(error) => {
-                (self.tiles, self.across) = (tiles, across.map(|across| Across { error: Some(error), ..across }));
-                return self.done;
+        let number = self.done.step + 1;
+        let draw = Draw::new(&self.model, &self.data, self.seed(), number, fraction, self.batch);
+        let (params, count, tiles) = (&self.model.params, draw.tiles(), &self.tiles);
+        let step = match &mut self.across {
+            None => tiles.differentiate(params, count, |which, params, ()| draw.loss(which, params)),
+            Some(Across { exchange, error, .. }) => {
+                let step = tiles
+                    .differentiate_across(&mut **exchange, params, count, |which, params, ()| draw.loss(which, params));
+                match step {
+                    Ok(step) => step,
+                    Err(lost) => {
+                        *error = Some(lost);
+                        return self.done;
+                    }
+                }
             }
         };
         let report = self.groups.update(&mut self.model.params, &step.grads, fraction, self.lr_scale);
-        tiles.take_back(step.grads);
-        (self.tiles, self.across) = (tiles, across);
         if number.is_multiple_of(TRIM_EVERY) {
             self.tiles.trim();
             self.pool.trim();
@@ -364,13 +371,7 @@ impl Trainer {
 
     /// The rays of the next step.
     fn draw(&self, fraction: f64) -> Draw<'_> {
-        let (number, total) = (self.done.step + 1, self.batch);
-        let tile = match self.model.sampler.batch_size() {
-            BatchSize::Rays { tile, .. } => tile,
-            // More, smaller tiles would cost a two-core machine an eighth of its time for recording.
-            BatchSize::Samples(_) => total.div_ceil(SLOTS),
-        };
-        Draw { model: &self.model, data: &self.data, seed: self.seed(), number, fraction, total, tile }
+        Draw::new(&self.model, &self.data, self.seed(), self.done.step + 1, fraction, self.batch)
     }
 
     /// Returns the lr scale, initially 1.
@@ -414,12 +415,13 @@ impl Trainer {
 
     /// Chooses the number of rays for the configured number of samples per step.
     fn adapt_batch(&mut self, work: &Work) {
-        if let BatchSize::Samples(samples) = self.model.sampler.batch_size() {
+        let size = self.model.sampler.batch_size();
+        if let BatchSize::Samples(samples) = size {
             let each = (work.marched as f64 / self.batch as f64).max(0.5);
             let rays = samples as f64 / each;
             // Averaged, since the number of samples per ray is noisy.
             let rays = (0.5 * (rays + self.batch as f64)).min(2.0 * self.batch as f64) as usize;
-            self.batch = rays.next_multiple_of(SLOTS).clamp(RAYS[0], RAYS[1]);
+            self.batch = rays.next_multiple_of(size.tile_count()).max(FEWEST_RAYS);
         }
     }
 

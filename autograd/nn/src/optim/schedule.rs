@@ -90,6 +90,17 @@ impl Schedule {
         }
     }
 
+    /// The schedule with its learning rates times `factor`.
+    pub fn scaled(mut self, factor: f64) -> Self {
+        match &mut self {
+            Schedule::Constant { lr } | Schedule::Step { from: lr, .. } => *lr *= factor,
+            Schedule::Linear { from, to, .. }
+            | Schedule::Exponential { from, to, .. }
+            | Schedule::Cosine { from, to, .. } => (*from, *to) = (*from * factor, *to * factor),
+        }
+        self
+    }
+
     /// Checks that the numbers are in their ranges. Rates are 0 to 1e30, which leaves f32 room for multiples, and at
     /// least 1e-30 in [`Exponential`](Self::Exponential). Fractions of the run are 0 to 1, and `every` is more than 0.
     ///
@@ -142,6 +153,21 @@ mod tests {
         for &(fraction, rate) in rates {
             let got = schedule.lr(fraction);
             assert!((got - rate).abs() < 1e-15, "{schedule:?} at {fraction}: {got} instead of {rate}");
+        }
+    }
+
+    #[test]
+    fn scaled_schedules_scale_at_every_point() {
+        for schedule in [
+            Schedule::Constant { lr: 0.3 },
+            Schedule::Linear { from: 1.0, to: 0.2, warmup: 0.5 },
+            Schedule::Step { from: 0.8, factor: 0.5, every: 0.25, warmup: 0.5 },
+            Schedule::Exponential { from: 1e-2, to: 1e-4, warmup: 0.1 },
+            Schedule::Cosine { from: 1.0, to: 0.1, warmup: 0.0 },
+        ] {
+            let points = [0.0, 0.1, 0.3, 0.7, 1.0].map(|fraction| (fraction, 3.0 * schedule.lr(fraction)));
+            assert_rates(schedule.scaled(3.0), &points);
+            assert_eq!(schedule.scaled(1.0), schedule);
         }
     }
 
