@@ -10,7 +10,7 @@ use raygrad::nerf::{
 use raygrad_scenes::embedded;
 use std::sync::Arc;
 
-/// Small networks, with more tiles than slots for gradient sums, and an incomplete last tile.
+/// Small networks, with an odd number of tiles, and an incomplete last tile.
 fn config(seed: u64) -> Config {
     let field = ClassicConfig { depth: 2, width: 32, skip_layers: vec![], view_width: 16, ..ClassicConfig::paper() };
     let sampler = HierarchicalConfig {
@@ -32,7 +32,7 @@ fn instant(seed: u64) -> Config {
         field.grid = HashGridConfig { levels: 3, log2_table: 10, finest: 64, ..field.grid };
     }
     if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
-        sampler.samples = 4096;
+        (sampler.step, sampler.samples) = (0.02, 4096);
         sampler.occupancy.resolution = 32;
     }
     config
@@ -76,10 +76,10 @@ fn outcome(data: &Arc<Dataset>, config: Config, steps: u32, threads: Option<usiz
 fn training_has_equal_bits_on_any_threads() {
     let data = Arc::new(embedded(Split::Val, 32));
     // Marched models take more steps, so that their occupancy grids change meanwhile.
-    for (name, config, steps) in [("hierarchical", config(7), 5), ("instant", instant(7), 40), ("voxel", voxel(7), 40)]
+    for (name, config, steps) in [("hierarchical", config(7), 5), ("instant", instant(7), 36), ("voxel", voxel(7), 36)]
     {
         let one = outcome(&data, config.clone(), steps, Some(1));
-        for threads in [Some(1), Some(2), Some(4), None] {
+        for threads in [Some(2), Some(4), None] {
             let other = outcome(&data, config.clone(), steps, threads);
             assert!(other.losses == one.losses, "{name}: losses on {threads:?} threads");
             assert!(other.params == one.params, "{name}: parameters on {threads:?} threads");

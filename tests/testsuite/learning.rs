@@ -72,14 +72,16 @@ fn learn(config: Config, steps: u64, train: Dataset, test: &Dataset) -> [f64; 2]
 #[test]
 fn embedded_scene_is_learned_in_seconds() {
     // Any field works with any sampler.
-    let marched = config().with_skip(Skip::Fast);
+    let mut marched = config().with_skip(Skip::Fast);
+    let sampler = marched.sampler.get_mut::<MarchingConfig>().unwrap();
+    (sampler.step, sampler.occupancy.resolution) = (0.02, 32);
     let huber = Config { loss: Loss::Huber { delta: 0.1 }, ..instant() };
     let configs = [
-        ("hierarchical", 150, config()),
-        ("marched", 150, marched),
-        ("instant", 80, instant()),
-        ("huber", 80, huber),
-        ("voxel", 80, voxel()),
+        ("hierarchical", 100, config()),
+        ("marched", 100, marched),
+        ("instant", 50, instant()),
+        ("huber", 50, huber),
+        ("voxel", 50, voxel()),
     ];
     let [train, test] = [Split::Train, Split::Test].map(|split| embedded(split, 40));
     for (name, steps, config) in configs {

@@ -246,6 +246,7 @@ mod tests {
         assert_eq!(note(18, "", BatchSize::Samples(4096)).as_deref(), Some(expected));
         let expected = "note: a training step keeps 4 of 9 cores busy; --batch-scale 2 uses more";
         assert_eq!(note(9, "", BatchSize::Rays { step: 64, tile: 16 }).as_deref(), Some(expected));
+        assert_eq!(note(8, "", BatchSize::Samples(4096)), None);
         assert_eq!(note(30, "--batch-scale 40", BatchSize::Samples(24576)), None);
     }
 

@@ -115,11 +115,12 @@ impl BatchSize {
         }
     }
 
-    /// How many times as large a step can become until it has a tile for each of these cores; 0 if it has more tiles
-    /// already.
+    /// How many times as large a step can become until it has a tile for each of these cores; 1 if it has enough.
     pub fn scale_for(self, cores: usize) -> usize {
+        let tiles = self.tile_count();
         match self {
-            BatchSize::Rays { .. } => cores / self.tile_count().max(1),
+            _ if tiles >= cores => 1,
+            BatchSize::Rays { .. } => cores / tiles.max(1),
             BatchSize::Samples(samples) => cores * TILE_SAMPLES / samples.max(1),
         }
     }

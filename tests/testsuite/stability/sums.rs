@@ -85,7 +85,7 @@ fn many_rows_to_few_places<T: Scalar>() {
     }
 }
 
-/// As many shares as a slot of a training step has samples, all for one row of a table. Such sums have the table's
+/// As many shares as a tile of a training step has samples, about, all for one row of a table. Such sums have the table's
 /// precision.
 fn shares_of_one_row_of_a_table<T: Scalar>() {
     let n = 2048;

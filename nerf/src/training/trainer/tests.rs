@@ -172,8 +172,7 @@ fn restart_resets_refined_cameras() {
 /// A trainer that refines these parameters and has taken `steps` steps, and whose poses have then moved each image by
 /// this angle in degrees.
 fn refining(parts: &[RefinedParam], steps: u64, motion: f64) -> Trainer {
-    let mut config = tiny_table().with_refined(parts);
-    config.sampler.get_mut::<MarchingConfig>().unwrap().samples = 512;
+    let config = tiny_table().with_refined(parts);
     let mut trainer = Trainer::new(config, Arc::new(ball(Split::Train, 32))).unwrap();
     (0..steps).for_each(|_| _ = trainer.step(0.01));
     let poses = trainer.model.params.find(POSES).unwrap();
@@ -307,7 +306,7 @@ fn tiny_table() -> Config {
         field.grid = HashGridConfig { levels: 3, features: 2, log2_table: 8, coarsest: 4, finest: 16 };
     }
     if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
-        sampler.occupancy.resolution = 16;
+        (sampler.step, sampler.samples, sampler.occupancy.resolution) = (0.04, 2048, 16);
     }
     config
 }
@@ -423,7 +422,9 @@ fn lr_scale_scales_all_updates() {
 
 #[test]
 fn batch_size_follows_wanted_samples() {
-    let mut trainer = Trainer::new(tiny_table(), Arc::new(ball(Split::Train, 12))).unwrap();
+    let mut config = tiny_table();
+    config.sampler.get_mut::<MarchingConfig>().unwrap().samples = 24576;
+    let mut trainer = Trainer::new(config, Arc::new(ball(Split::Train, 12))).unwrap();
     let mut next = |batch: usize, marched: u64| {
         trainer.batch = batch;
         trainer.adapt_batch(&Work { marched, ..Work::default() });
@@ -432,10 +433,21 @@ fn batch_size_follows_wanted_samples() {
     // 24576 samples of 8 per ray are 3072 rays; the change is half of the difference.
     assert_eq!(next(1024, 8 * 1024), 2048);
     assert_eq!(next(5120, 8 * 5120), 4096);
-    // At most twice as many, in whole slots, and within bounds.
+    // At most twice as many, in tiles of equal size, and at least 256.
     assert_eq!([next(1024, 1024), next(1024, 0)], [2048; 2]);
     assert_eq!(next(1500, 8 * 1500), 2288);
     assert_eq!(next(256, 10_000_000), 256);
+    // A tile of a large step has about 3072 samples.
+    let mut config = tiny_table();
+    config.sampler.get_mut::<MarchingConfig>().unwrap().samples = 40_000;
+    let mut trainer = Trainer::new(config, Arc::new(ball(Split::Train, 12))).unwrap();
+    for rays in [256, 5000, 5005] {
+        trainer.batch = rays;
+        assert_eq!(trainer.draw(0.0).tiles(), 13);
+    }
+    trainer.batch = 1000;
+    trainer.adapt_batch(&Work { marched: 8000, ..Work::default() });
+    assert_eq!(trainer.batch, 2002);
 }
 
 /// The ball, with alpha between 0 and 1 at places.

@@ -31,6 +31,13 @@ fn trainer(config: Config) -> Trainer {
     Trainer::new(config, Arc::new(ball(Split::Train, 12))).unwrap()
 }
 
+/// With steps of 13 tiles, in which the number of rays grows at first.
+fn many_tiles() -> Config {
+    let mut config = tiny_table();
+    config.sampler.get_mut::<MarchingConfig>().unwrap().samples = 40_000;
+    config
+}
+
 /// The state without times, which differ.
 fn state(mut trainer: Trainer) -> Vec<u8> {
     (trainer.elapsed, trainer.done.train_seconds) = (Duration::ZERO, 0.0);
@@ -43,7 +50,8 @@ fn shared_steps_have_the_bits_of_one_process() {
     let mut large_grid = tiny_table();
     large_grid.sampler.get_mut::<MarchingConfig>().unwrap().occupancy.resolution = 32;
     let refined = tiny_table().with_refined(&[RefinedParam::Poses, RefinedParam::Exposure]);
-    for (config, steps) in [(tiny(), 12), (tiny_table(), 12), (large_grid, 36), (refined, 12)] {
+    let steps = [(tiny(), 12), (tiny_table(), 12), (large_grid, 36), (refined, 12), (many_tiles(), 6)];
+    for (config, steps) in steps {
         let run = |_: usize, mut trainer: Trainer| {
             trainer.run(Budget::Steps(steps), |_| ControlFlow::Continue(()));
             assert_eq!(trainer.exchange_error(), None);
@@ -66,18 +74,19 @@ fn checkpoint_of_two_ranks_resumes_on_three() {
             }
         }
     };
-    let mut alone = trainer(tiny_table());
+    let mut alone = trainer(many_tiles());
     steps(0, 12)(&mut alone);
     let half = on_ranks(
         2,
-        |_| trainer(tiny_table()),
+        |_| trainer(many_tiles()),
         |_, mut trainer| {
             steps(0, 6)(&mut trainer);
+            assert!(trainer.batch > 1000 && trainer.draw(0.5).tiles() == 13);
             trainer.state().unwrap()
         },
     );
     let resumed = |_| {
-        let mut trainer = trainer(tiny_table());
+        let mut trainer = trainer(many_tiles());
         trainer.load_state(&half[0]).unwrap();
         trainer
     };
