@@ -15,7 +15,7 @@ use raygrad::nerf::Jitter;
 use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::encoding::hash_grid::HashGrid;
 use raygrad::nerf::space::occupancy::Step;
-use raygrad::nerf::{BatchSize, Config, Instant, InstantConfig, Model, Query, Rays, SceneBox};
+use raygrad::nerf::{Config, Instant, InstantConfig, Model, Query, Rays, SceneBox};
 use raygrad::tensor::matmul::{Matrix, gemm};
 use raygrad::tensor::simd;
 use raygrad::{Adam, Optimizer, Params, Pool, Tape, Tensor};
@@ -108,7 +108,7 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
     let any: &dyn Any = &*model.field;
     let table = any.downcast_ref::<Instant>().ok_or("a field that is not instant")?.grid();
     let (id, grid, field) = (table.table(), table.grid(), &*model.field);
-    let wanted = sampler.config.samples / BatchSize::Samples(sampler.config.samples).tile_count();
+    let wanted = sampler.config.samples / sampler.config.tiles;
     let (probe, _) = batch(model, data, 256);
     let (step, pool) = (Step::uniform(sampler.step()), Pool::new());
     let marched = |rays: &Rays<f32>| {

@@ -25,7 +25,7 @@ pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
     let cells = model.sampler.grid().map_or(0, |grid| grid.cells());
     let samples = match model.sampler.batch_size() {
         // Tapes hold as many tiles as threads work: as measured with 8 tiles in a step.
-        size @ BatchSize::Samples(samples) => 8 * samples / size.tile_count(),
+        BatchSize::Samples { step, tiles } => 8 * step / tiles.max(1),
         // The tape of a few rays is negligible.
         BatchSize::Rays { .. } => 0,
     };

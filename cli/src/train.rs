@@ -12,6 +12,7 @@ use clap::Parser;
 use raygrad::Schedule;
 use raygrad::nerf::dataset::{AutomaticDownscale, Dataset, DownscaleLimit, Format, HoldOut, SceneType, Split};
 use raygrad::nerf::model::RefinedParam;
+use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Error, Preset, Result, StepStats, Trainer, available_memory};
 use serde::{Deserialize, Serialize};
@@ -112,9 +113,8 @@ pub struct Args {
     steps: Option<u64>,
     /// Enlarge training steps N times
     ///
-    /// Larger steps keep more cores busy, of all machines together; `train` prints a note where it could help. The
-    /// samples or rays of a step, also if --set changes them, become N times as many, and learning rates grow by the
-    /// square root of N. Range: 1 to 64.
+    /// For machines with many cores. The samples or rays of a step, also if --set changes them, become N times as
+    /// many, and learning rates grow by the square root of N. Range: 1 to 64.
     #[arg(long, help_heading = "Advanced", value_name = "N", default_value_t = 1, value_parser = parse::count(config::MOST_BATCH_SCALE))]
     batch_scale: usize,
     /// Random seed
@@ -309,7 +309,8 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     describe(&run, &trainer, &data, &scene)?;
     // Warnings come after all checks, so that an error is the only line of output.
     doctor::warn(&scene);
-    if let Some(note) = args.idle_cores(trainer.model.sampler.batch_size()) {
+    let marching = trainer.model.config.sampler.get::<MarchingConfig>();
+    if let Some(note) = marching.and_then(|marching| args.idle_cores(marching.tiles)) {
         complain(&note);
     }
     if let Some(limit) = limit {

@@ -6,7 +6,7 @@ use raygrad::nerf::dataset::{Dataset, SceneType};
 use raygrad::nerf::losses::DepthConfig;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
-use raygrad::nerf::{BatchSize, Budget, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
+use raygrad::nerf::{Budget, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
 use serde_json::Value;
 
 use super::super::cameras::Viewpoint;
@@ -52,6 +52,10 @@ impl Args {
         }
         if self.no_positional_encoding {
             config = config.without_positional_encoding();
+        }
+        // A number of steps gives the same model on any machine.
+        if let Budget::Time(_) = self.budget() {
+            config = config.with_cores(cores());
         }
         let config = self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))?;
         let config = config.with_batch_scale(self.batch_scale);
@@ -120,12 +124,14 @@ impl Args {
         self.budget().samples_on(cores(), self.batch_scale)
     }
 
-    /// The note for steps of this size if steps of twice the size or more would take no longer.
-    pub fn idle_cores(&self, size: BatchSize) -> Option<String> {
-        let (cores, tiles) = (cores(), size.tile_count());
-        let scale = (self.batch_scale * size.scale_for(cores)).min(MOST_BATCH_SCALE);
-        (scale >= 2 * self.batch_scale).then(|| {
-            format!("note: a training step keeps {tiles} of {cores} cores busy; --batch-scale {scale} uses more")
+    /// The note for steps with so many tiles if that leaves cores idle.
+    pub fn idle_cores(&self, tiles: usize) -> Option<String> {
+        let cores = cores();
+        (tiles < cores).then(|| {
+            format!(
+                "note: steps of {tiles} tiles keep {tiles} of {cores} cores busy; `--set sampler.tiles=N` changes the \
+                 number, and the last bits of the model"
+            )
         })
     }
 
@@ -228,26 +234,24 @@ mod tests {
 
     #[test]
     fn idle_cores_are_noted() {
-        let note = |threads: usize, flags: &str, size: BatchSize| {
+        let data = raygrad_scenes::landscape(raygrad::nerf::dataset::Split::Test, 8);
+        let tiles = |threads: usize, flags: &str| {
             let args = Args::parse_from(format!("train {flags}").split_whitespace());
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| args.idle_cores(size))
+            pool.install(|| {
+                let tiles = args.config(&data).unwrap().sampler.get::<MarchingConfig>().unwrap().tiles;
+                (tiles, args.idle_cores(tiles))
+            })
         };
-        let usual = BatchSize::Samples(24576);
-        // Of 15 cores, 16 tiles would keep 15 busy and then one.
-        assert_eq!([note(8, "", usual), note(15, "", usual)], [None, None]);
-        let expected = "note: a training step keeps 8 of 18 cores busy; --batch-scale 2 uses more";
-        assert_eq!(note(18, "", usual).as_deref(), Some(expected));
-        assert_eq!(note(16, "--batch-scale 2", BatchSize::Samples(49152)), None);
-        let expected = "note: a training step keeps 16 of 32 cores busy; --batch-scale 4 uses more";
-        assert_eq!(note(32, "--batch-scale 2", BatchSize::Samples(49152)).as_deref(), Some(expected));
-        // Small steps have small tiles.
-        let expected = "note: a training step keeps 8 of 18 cores busy; --batch-scale 13 uses more";
-        assert_eq!(note(18, "", BatchSize::Samples(4096)).as_deref(), Some(expected));
-        let expected = "note: a training step keeps 4 of 9 cores busy; --batch-scale 2 uses more";
-        assert_eq!(note(9, "", BatchSize::Rays { step: 64, tile: 16 }).as_deref(), Some(expected));
-        assert_eq!(note(8, "", BatchSize::Samples(4096)), None);
-        assert_eq!(note(30, "--batch-scale 40", BatchSize::Samples(24576)), None);
+        // A model of a number of steps is the same on any machine.
+        let expected = "note: steps of 8 tiles keep 8 of 18 cores busy; `--set sampler.tiles=N` changes the number, and \
+                        the last bits of the model";
+        assert_eq!(tiles(18, "--steps 100"), (8, Some(expected.to_owned())));
+        assert_eq!(tiles(18, "--steps 100 --set sampler.tiles=20"), (20, None));
+        assert_eq!(tiles(8, "--steps 100"), (8, None));
+        assert_eq!(tiles(18, "--budget 1m"), (18, None));
+        assert_eq!(tiles(18, "--budget 1m --batch-scale 2"), (36, None));
+        assert_eq!(tiles(3, "--budget 1m"), (8, None));
     }
 
     #[test]

@@ -23,6 +23,8 @@ use std::str::FromStr;
 
 /// The factor of the samples per step in unbounded scenes: most of them are behind opaque parts and cost little.
 const SAMPLES: usize = 4;
+/// The most tiles of a step for many cores. More would spend more time on recording than they gain.
+const MOST_TILES: usize = 64;
 /// Weight of the distortion loss in unbounded scenes, where few images show each point.
 const DISTORTION: f64 = 0.1;
 /// The same with proposals, as in nerfacto. With the weight above they collapse onto floaters.
@@ -290,8 +292,8 @@ impl Config {
             } else {
                 let occupancy = &mut marching.occupancy;
                 (occupancy.cascades, occupancy.resolution) = (1, usual.occupancy.resolution);
-                *marching =
-                    MarchingConfig { occupancy: marching.occupancy, samples: marching.samples / SAMPLES, ..usual };
+                let MarchingConfig { occupancy, tiles, samples, .. } = *marching;
+                *marching = MarchingConfig { occupancy, tiles, samples: samples / SAMPLES, ..usual };
             }
         }
         let field = self.field.get_mut::<InstantConfig>();
@@ -338,19 +340,27 @@ impl Config {
         self
     }
 
-    /// Makes training steps `scale` times as large, which keeps more cores busy: large steps have more
-    /// [tiles](crate::BatchSize::tile_count). All learning rates grow by the square root of `scale`, as Malladi et al. 2022
+    /// Gives a training step a [tile](MarchingConfig::tiles) for each of `cores`, up to 64, if it has fewer. It changes the
+    /// last bits of a model.
+    pub fn with_cores(mut self, cores: usize) -> Self {
+        if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
+            marching.tiles = marching.tiles.max(cores.min(MOST_TILES));
+        }
+        self
+    }
+
+    /// Makes training steps `scale` times as large, in as many more [tiles](MarchingConfig::tiles). All learning rates grow by the square root of `scale`, as Malladi et al. 2022
     /// derive for Adam ("On the SDEs and Scaling Rules for Adaptive Gradient Algorithms"; their rule for the moments'
     /// constants is not applied). Samplers of other crates keep their size. Call it last. Figures are in
-    /// docs/benchmarks/results.md, section Large steps.
+    /// docs/benchmarks/results.md, section Many cores.
     ///
     /// # Panics
     /// If `scale` is 0.
     pub fn with_batch_scale(mut self, scale: usize) -> Self {
         assert!(scale > 0, "a batch scale of 0; use 1 or more");
         let sampler = &mut self.sampler;
-        let samples = sampler.get_mut::<MarchingConfig>().map(|marching| &mut marching.samples);
-        samples.into_iter().for_each(|size| *size = size.saturating_mul(scale));
+        let marching = sampler.get_mut::<MarchingConfig>().map(|marching| [&mut marching.samples, &mut marching.tiles]);
+        marching.into_iter().flatten().for_each(|size| *size = size.saturating_mul(scale));
         let batch = sampler.get_mut::<HierarchicalConfig>().map(|hierarchical| &mut hierarchical.batch);
         batch.into_iter().for_each(|size| *size = size.saturating_mul(scale));
         let batch = sampler.get_mut::<ProposalConfig>().map(|proposal| &mut proposal.batch);
@@ -535,6 +545,21 @@ mod tests {
     }
 
     #[test]
+    fn tiles_follow_the_cores() {
+        let tiles = |cores: usize, set: usize| {
+            let mut config = Config::preset(Preset::Instant);
+            config.sampler.get_mut::<MarchingConfig>().unwrap().tiles = set;
+            let config = config.with_cores(cores).with_scene_type(SceneType::Unbounded);
+            config.check().unwrap();
+            let config = config.with_scene_type(SceneType::Bounded);
+            config.sampler.get::<MarchingConfig>().unwrap().tiles
+        };
+        assert_eq!([tiles(2, 8), tiles(20, 8), tiles(20, 30), tiles(100, 8)], [8, 20, 30, 64]);
+        let classic = Config::preset(Preset::Classic);
+        assert_eq!(classic.clone().with_cores(99), classic);
+    }
+
+    #[test]
     fn batch_scale_grows_steps_and_learning_rates() {
         let all = [
             RefinedParam::Poses,
@@ -556,7 +581,8 @@ mod tests {
             scaled.check().unwrap();
             let size = |config: &Config| {
                 let sampler = &config.sampler;
-                let samples = sampler.get::<MarchingConfig>().map(|marching| marching.samples);
+                let samples =
+                    sampler.get::<MarchingConfig>().map(|marching| marching.samples.min(3072 * marching.tiles));
                 let batch = sampler.get::<HierarchicalConfig>().map(|hierarchical| hierarchical.batch);
                 samples.or(batch).or_else(|| Some(sampler.get::<ProposalConfig>()?.batch)).unwrap()
             };

@@ -55,12 +55,23 @@ pub struct MarchingConfig {
     pub cone: f64,
     /// Samples in a training step. The number of rays follows from it. Range: 1 to 16777216.
     pub samples: usize,
+    /// Tiles of a training step: parts that are computed at the same time, each by one core. More tiles keep more cores
+    /// busy, and cost time for recording. The last bits of a model depend on it. Range: 1 to 4096.
+    #[serde(default = "usual_tiles")]
+    pub tiles: usize,
     /// Early termination in training: samples are dropped where the transmittance is below this. A colour changes
     /// by at most as much. Range: 0 to 1.
     #[serde(alias = "termination")]
     pub early_stop_eps: f64,
     /// Quadrature rule for the integral along a ray.
     pub quadrature: Quadrature,
+}
+
+/// Tiles of a training step, unless more cores are there.
+pub(crate) const TILES: usize = 8;
+
+fn usual_tiles() -> usize {
+    TILES
 }
 
 impl Default for MarchingConfig {
@@ -74,6 +85,7 @@ impl Default for MarchingConfig {
             view_step: 1.0 / 600.0,
             cone: 0.0,
             samples: 24576,
+            tiles: TILES,
             early_stop_eps: 1e-3,
             quadrature: Quadrature::Midpoint,
         }
@@ -104,6 +116,7 @@ impl ComponentConfig<Samplers> for MarchingConfig {
         check_range("view_step", self.view_step, 1e-5, 1.0)?;
         check_range("cone", self.cone, 0.0, 1.0)?;
         check_range("samples", self.samples, 1, 1 << 24)?;
+        check_range("tiles", self.tiles, 1, 4096)?;
         self.quadrature.check()?;
         check_range("early_stop_eps", self.early_stop_eps, 0.0, 1.0)
     }
@@ -211,7 +224,7 @@ impl<T: Scalar> Sampler<T> for Marching {
     }
 
     fn batch_size(&self) -> BatchSize {
-        BatchSize::Samples(self.config.samples)
+        BatchSize::Samples { step: self.config.samples, tiles: self.config.tiles }
     }
 
     fn boxed(&self) -> Box<dyn Sampler<T>> {

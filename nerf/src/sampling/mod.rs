@@ -96,32 +96,21 @@ pub enum BatchSize {
         /// Rays per tile: one tape, on one core.
         tile: usize,
     },
-    /// The number of rays that holds about this many samples.
-    Samples(usize),
+    /// The number of rays that holds about so many samples.
+    Samples {
+        /// Samples per step.
+        step: usize,
+        /// Tiles of a step: one tape each, on one core each.
+        tiles: usize,
+    },
 }
-
-/// Samples of a tile of a large step, about. Half as many would cost two cores 5 % of their time for recording, an eighth
-/// 35 %.
-const TILE_SAMPLES: usize = 3072;
-/// Tiles of a small step, and of a usual one of a bounded scene.
-pub(crate) const TILES: usize = 8;
 
 impl BatchSize {
     /// Tiles in a step, at most. No more threads can work on them at a time.
     pub fn tile_count(self) -> usize {
         match self {
             BatchSize::Rays { step, tile } => step.div_ceil(tile.max(1)),
-            BatchSize::Samples(samples) => (samples / TILE_SAMPLES).max(TILES),
-        }
-    }
-
-    /// How many times as large a step can become until it has a tile for each of these cores; 1 if it has enough.
-    pub fn scale_for(self, cores: usize) -> usize {
-        let tiles = self.tile_count();
-        match self {
-            _ if tiles >= cores => 1,
-            BatchSize::Rays { .. } => cores / tiles.max(1),
-            BatchSize::Samples(samples) => cores * TILE_SAMPLES / samples.max(1),
+            BatchSize::Samples { tiles, .. } => tiles.max(1),
         }
     }
 }

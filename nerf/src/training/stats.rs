@@ -1,7 +1,7 @@
 //! The training budget, and statistics of a step.
 
 use crate::model::PoseMotion;
-use crate::sampling::TILES;
+use crate::sampling::marching::TILES;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::time::Duration;
 
@@ -40,8 +40,8 @@ impl Budget {
     }
 
     /// As [`samples`](Self::samples), on this number of cores of all machines, with steps that are larger by this
-    /// [scale](crate::Config::with_batch_scale). Of the cores as many count as a usual step of a bounded scene, so
-    /// enlarged, has tiles.
+    /// [scale](crate::Config::with_batch_scale). More cores than 8 times the scale count as so many: no machine with more
+    /// was measured.
     pub fn samples_on(self, cores: usize, batch_scale: usize) -> f64 {
         match self {
             Budget::Steps(steps) => steps as f64 * SAMPLES_PER_STEP * batch_scale as f64,

@@ -80,7 +80,7 @@ impl<'a> Draw<'a> {
         let size = model.sampler.batch_size();
         let tile = match size {
             BatchSize::Rays { tile, .. } => tile,
-            BatchSize::Samples(_) => total.div_ceil(size.tile_count()),
+            BatchSize::Samples { .. } => total.div_ceil(size.tile_count()),
         };
         Draw { model, data, seed, number, fraction, total, tile }
     }
@@ -156,7 +156,7 @@ impl Trainer {
             pool: Pool::new(),
             batch: match model.sampler.batch_size() {
                 BatchSize::Rays { step, .. } => step,
-                BatchSize::Samples(_) => FEWEST_RAYS,
+                BatchSize::Samples { .. } => FEWEST_RAYS,
             },
             model,
             data,
@@ -416,12 +416,12 @@ impl Trainer {
     /// Chooses the number of rays for the configured number of samples per step.
     fn adapt_batch(&mut self, work: &Work) {
         let size = self.model.sampler.batch_size();
-        if let BatchSize::Samples(samples) = size {
+        if let BatchSize::Samples { step: samples, tiles } = size {
             let each = (work.marched as f64 / self.batch as f64).max(0.5);
             let rays = samples as f64 / each;
             // Averaged, since the number of samples per ray is noisy.
             let rays = (0.5 * (rays + self.batch as f64)).min(2.0 * self.batch as f64) as usize;
-            self.batch = rays.next_multiple_of(size.tile_count()).max(FEWEST_RAYS);
+            self.batch = rays.next_multiple_of(tiles).max(FEWEST_RAYS);
         }
     }
 

@@ -437,9 +437,10 @@ fn batch_size_follows_wanted_samples() {
     assert_eq!([next(1024, 1024), next(1024, 0)], [2048; 2]);
     assert_eq!(next(1500, 8 * 1500), 2288);
     assert_eq!(next(256, 10_000_000), 256);
-    // A tile of a large step has about 3072 samples.
+    // Other numbers of tiles, the last of which may be smaller.
     let mut config = tiny_table();
-    config.sampler.get_mut::<MarchingConfig>().unwrap().samples = 40_000;
+    let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
+    (sampler.samples, sampler.tiles) = (40_000, 13);
     let mut trainer = Trainer::new(config, Arc::new(ball(Split::Train, 12))).unwrap();
     for rays in [256, 5000, 5005] {
         trainer.batch = rays;
