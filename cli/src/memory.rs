@@ -24,8 +24,7 @@ pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
     let model = &trainer.model;
     let cells = model.sampler.grid().map_or(0, |grid| grid.cells());
     let samples = match model.sampler.batch_size() {
-        // Tapes hold as many tiles as threads work: as measured with 8 tiles in a step.
-        BatchSize::Samples { step, tiles } => 8 * step / tiles.max(1),
+        BatchSize::Samples { step, .. } => step,
         // The tape of a few rays is negligible.
         BatchSize::Rays { .. } => 0,
     };

@@ -369,13 +369,25 @@ mod tests {
 
     #[test]
     fn join_uses_an_idle_thread_unless_it_is_serial() {
-        let thread = || {
-            std::thread::sleep(std::time::Duration::from_millis(20));
-            rayon::current_thread_index()
+        use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
+        use std::time::{Duration, Instant};
+        let (came, start) = (AtomicUsize::new(0), Instant::now());
+        // Each waits until the other one has begun.
+        let meet = || {
+            came.fetch_add(1, SeqCst);
+            while came.load(SeqCst) < 2 && start.elapsed() < Duration::from_secs(60) {
+                std::thread::yield_now();
+            }
+            start.elapsed() < Duration::from_secs(60)
         };
         let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
-        let (together, alone) = pool.install(|| (super::join(thread, thread), serial(|| super::join(thread, thread))));
-        assert!(together.0 != together.1 && alone.0 == alone.1, "{together:?} {alone:?}");
+        assert_eq!(pool.install(|| super::join(meet, meet)), (true, true));
+        let thread = || {
+            std::thread::sleep(Duration::from_millis(1));
+            rayon::current_thread_index()
+        };
+        let alone: Vec<_> = pool.install(|| serial(|| (0..20).map(|_| super::join(thread, thread)).collect()));
+        assert!(alone.iter().all(|(a, b)| a == b), "{alone:?}");
     }
 
     #[test]

@@ -19,7 +19,7 @@ use std::sync::Mutex;
 /// Gradients are added in a fixed tree: those of each half of the tiles, then the two sums. So the bits are the same for
 /// any number of threads, and as many threads can work as there are tiles. Sparse contributions are not summed, but stay
 /// in the order of the tiles. Tapes and scratch data (`S`) are kept from step to step, one for each thread at work. They
-/// own the memory of gradients too: after some steps no tensor-sized memory is allocated.
+/// own the memory of gradients too: after some steps of one process no tensor-sized memory is allocated.
 ///
 /// [`differentiate_across`](Self::differentiate_across) shares the tiles between processes.
 ///
@@ -73,7 +73,7 @@ impl<T: Scalar, S: Default + Send> Default for Tiles<T, S> {
 }
 
 impl<T: Scalar, S: Default + Send> Tiles<T, S> {
-    /// Without kept tapes.
+    /// Creates tiles that keep no tapes yet.
     pub fn new() -> Self {
         let readers = BTreeMap::from([(RowGrad::<T>::KIND, RowGrad::read as ReadSparse<T>)]);
         Tiles { free: Mutex::default(), readers }
@@ -415,6 +415,20 @@ mod tests {
                 assert!(worst <= 1e-5 * 10.max(count) as f32, "{count} tiles: {worst}");
             }
         }
+    }
+
+    #[test]
+    fn halves_are_added_first() {
+        let mut params = Params::new();
+        let x = params.add("x", Tensor::scalar(1.0_f32));
+        let v = [1e8, 1.0, -1e8, 0.3, 5.7, 1e7, 0.01, -1e7];
+        let sum = |count: usize| {
+            let step = Tiles::<f32>::new()
+                .differentiate(&params, count, |tile, params, ()| (&params[x] * f64::from(v[tile]), ()));
+            step.grads[0].dense().unwrap().item()
+        };
+        assert_eq!(sum(8), ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7])));
+        assert_eq!(sum(5), (v[0] + v[1]) + (v[2] + (v[3] + v[4])));
     }
 
     #[test]

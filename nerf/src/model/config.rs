@@ -25,6 +25,8 @@ use std::str::FromStr;
 const SAMPLES: usize = 4;
 /// The most tiles of a step for many cores. More would spend more time on recording than they gain.
 const MOST_TILES: usize = 64;
+/// The same for the samples of a tile.
+const LEAST_SAMPLES: usize = 384;
 /// Weight of the distortion loss in unbounded scenes, where few images show each point.
 const DISTORTION: f64 = 0.1;
 /// The same with proposals, as in nerfacto. With the weight above they collapse onto floaters.
@@ -340,19 +342,19 @@ impl Config {
         self
     }
 
-    /// Gives a training step a [tile](MarchingConfig::tiles) for each of `cores`, up to 64, if it has fewer. It changes the
-    /// last bits of a model.
+    /// Gives a training step a [tile](MarchingConfig::tiles) for each of `cores`, if it has fewer: up to 64, and up to one
+    /// for 384 samples. Call it after the sampler is chosen.
     pub fn with_cores(mut self, cores: usize) -> Self {
         if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
-            marching.tiles = marching.tiles.max(cores.min(MOST_TILES));
+            marching.tiles = marching.tiles.max(cores.min(MOST_TILES).min(marching.samples / LEAST_SAMPLES));
         }
         self
     }
 
-    /// Makes training steps `scale` times as large, in as many more [tiles](MarchingConfig::tiles). All learning rates grow by the square root of `scale`, as Malladi et al. 2022
-    /// derive for Adam ("On the SDEs and Scaling Rules for Adaptive Gradient Algorithms"; their rule for the moments'
-    /// constants is not applied). Samplers of other crates keep their size. Call it last. Figures are in
-    /// docs/benchmarks/results.md, section Many cores.
+    /// Makes training steps `scale` times as large, in `scale` times as many [tiles](MarchingConfig::tiles). All learning
+    /// rates grow by the square root of `scale`, as Malladi et al. 2022 derive for Adam ("On the SDEs and Scaling Rules for
+    /// Adaptive Gradient Algorithms"; their rule for the moments' constants is not applied). Samplers of other crates keep
+    /// their size. Call it last. Figures are in docs/benchmarks/results.md, section Many cores.
     ///
     /// # Panics
     /// If `scale` is 0.
@@ -555,6 +557,8 @@ mod tests {
             config.sampler.get::<MarchingConfig>().unwrap().tiles
         };
         assert_eq!([tiles(2, 8), tiles(20, 8), tiles(20, 30), tiles(100, 8)], [8, 20, 30, 64]);
+        let small = Config::preset(Preset::Small).with_skip(Skip::Fast).with_cores(64);
+        assert_eq!(small.sampler.get::<MarchingConfig>().unwrap().tiles, 10);
         let classic = Config::preset(Preset::Classic);
         assert_eq!(classic.clone().with_cores(99), classic);
     }

@@ -56,8 +56,7 @@ pub struct MarchingConfig {
     /// Samples in a training step. The number of rays follows from it. Range: 1 to 16777216.
     pub samples: usize,
     /// Tiles of a training step: parts that are computed at the same time, each by one core. More tiles keep more cores
-    /// busy, and cost time for recording. The last bits of a model depend on it. Range: 1 to 4096.
-    #[serde(default = "usual_tiles")]
+    /// busy, and cost time for recording. Another number gives another model, as another seed does. Range: 1 to 4096.
     pub tiles: usize,
     /// Early termination in training: samples are dropped where the transmittance is below this. A colour changes
     /// by at most as much. Range: 0 to 1.
@@ -69,10 +68,6 @@ pub struct MarchingConfig {
 
 /// Tiles of a training step, unless more cores are there.
 pub(crate) const TILES: usize = 8;
-
-fn usual_tiles() -> usize {
-    TILES
-}
 
 impl Default for MarchingConfig {
     fn default() -> Self {

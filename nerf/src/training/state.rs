@@ -13,7 +13,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
 /// The most rays per step.
-const MOST_RAYS: usize = 1 << 20;
+pub(super) const MOST_RAYS: usize = 1 << 20;
 /// The name of the trainer's own numbers in the file.
 const TRAINER: &str = "trainer";
 

@@ -36,18 +36,15 @@ impl Budget {
     ///
     /// For steps it is the same on any machine; for a time it grows with the number of threads.
     pub fn samples(self) -> f64 {
-        self.samples_on(rayon::current_num_threads(), 1)
+        self.samples_on(rayon::current_num_threads())
     }
 
-    /// As [`samples`](Self::samples), on this number of cores of all machines, with steps that are larger by this
-    /// [scale](crate::Config::with_batch_scale). More cores than 8 times the scale count as so many: no machine with more
+    /// As [`samples`](Self::samples), on this number of cores of all machines. More than 8 count as 8: no machine with more
     /// was measured.
-    pub fn samples_on(self, cores: usize, batch_scale: usize) -> f64 {
+    pub fn samples_on(self, cores: usize) -> f64 {
         match self {
-            Budget::Steps(steps) => steps as f64 * SAMPLES_PER_STEP * batch_scale as f64,
-            Budget::Time(time) => {
-                time.as_secs_f64() * SAMPLES_PER_SECOND * cores.min(TILES.saturating_mul(batch_scale)) as f64
-            }
+            Budget::Steps(steps) => steps as f64 * SAMPLES_PER_STEP,
+            Budget::Time(time) => time.as_secs_f64() * SAMPLES_PER_SECOND * cores.min(TILES) as f64,
         }
     }
 }
@@ -181,11 +178,8 @@ mod tests {
             assert_eq!(budget.samples(), samples);
         }
         let minute = Budget::Time(Duration::from_secs(60));
-        assert_eq!(
-            [(4, 1), (12, 1), (12, 2)].map(|(cores, scale)| minute.samples_on(cores, scale)),
-            [2.4e8, 4.8e8, 7.2e8]
-        );
-        assert_eq!(Budget::Steps(10).samples_on(99, 3), 30.0 * 24576.0);
+        assert_eq!([4, 8, 12].map(|cores| minute.samples_on(cores)), [2.4e8, 4.8e8, 4.8e8]);
+        assert_eq!(Budget::Steps(10).samples_on(99), 10.0 * 24576.0);
         assert!(read(r#"{"seconds":-1}"#).is_err() && read(r#"{"seconds":1e300}"#).is_err());
     }
 

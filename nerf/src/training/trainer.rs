@@ -4,6 +4,7 @@ use super::across::Across;
 use super::groups::Groups;
 use super::pass::{Work, rays_loss};
 use super::startup;
+use super::state::MOST_RAYS;
 use super::stats::{Budget, StepStats};
 use crate::camera::Camera;
 use crate::dataset::batch::Batch;
@@ -13,6 +14,7 @@ use crate::imaging::metrics::psnr_from_mse;
 use crate::model::config::Config;
 use crate::model::{Model, POSES, SceneBox, densities};
 use crate::random::{Jitter, stream};
+use crate::sampling::marching::TILES;
 use crate::sampling::{BatchSize, Progress};
 use crate::space::occupancy::Shares;
 use crate::{Error, Result};
@@ -415,13 +417,12 @@ impl Trainer {
 
     /// Chooses the number of rays for the configured number of samples per step.
     fn adapt_batch(&mut self, work: &Work) {
-        let size = self.model.sampler.batch_size();
-        if let BatchSize::Samples { step: samples, tiles } = size {
+        if let BatchSize::Samples { step: samples, .. } = self.model.sampler.batch_size() {
             let each = (work.marched as f64 / self.batch as f64).max(0.5);
             let rays = samples as f64 / each;
             // Averaged, since the number of samples per ray is noisy.
             let rays = (0.5 * (rays + self.batch as f64)).min(2.0 * self.batch as f64) as usize;
-            self.batch = rays.next_multiple_of(tiles).max(FEWEST_RAYS);
+            self.batch = rays.next_multiple_of(TILES).clamp(FEWEST_RAYS, MOST_RAYS);
         }
     }
 

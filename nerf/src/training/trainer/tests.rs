@@ -433,7 +433,7 @@ fn batch_size_follows_wanted_samples() {
     // 24576 samples of 8 per ray are 3072 rays; the change is half of the difference.
     assert_eq!(next(1024, 8 * 1024), 2048);
     assert_eq!(next(5120, 8 * 5120), 4096);
-    // At most twice as many, in tiles of equal size, and at least 256.
+    // At most twice as many, a multiple of 8, and at least 256.
     assert_eq!([next(1024, 1024), next(1024, 0)], [2048; 2]);
     assert_eq!(next(1500, 8 * 1500), 2288);
     assert_eq!(next(256, 10_000_000), 256);
@@ -448,7 +448,14 @@ fn batch_size_follows_wanted_samples() {
     }
     trainer.batch = 1000;
     trainer.adapt_batch(&Work { marched: 8000, ..Work::default() });
-    assert_eq!(trainer.batch, 2002);
+    assert_eq!(trainer.batch, 2000);
+    // A step is no larger than a checkpoint may say.
+    let mut config = tiny_table();
+    config.sampler.get_mut::<MarchingConfig>().unwrap().samples = 1 << 24;
+    let mut trainer = Trainer::new(config, Arc::new(ball(Split::Train, 12))).unwrap();
+    (trainer.batch, trainer.done.step) = (MOST_RAYS, 1);
+    trainer.adapt_batch(&Work { marched: 1000, ..Work::default() });
+    assert_eq!(trainer.batch, MOST_RAYS);
 }
 
 /// The ball, with alpha between 0 and 1 at places.
