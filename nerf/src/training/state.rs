@@ -1,7 +1,7 @@
 //! Training state: saving and resuming a run.
 
 use super::groups::Groups;
-use super::stats::StepStats;
+use super::stats::{MOST_RAYS, StepStats};
 use super::trainer::Trainer;
 use crate::model::Model;
 use crate::model::SceneBox;
@@ -12,8 +12,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
-/// The most rays per step.
-pub(super) const MOST_RAYS: usize = 1 << 20;
 /// The name of the trainer's own numbers in the file.
 const TRAINER: &str = "trainer";
 

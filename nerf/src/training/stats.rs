@@ -26,6 +26,8 @@ pub enum Budget {
     Time(Duration),
 }
 
+/// The most rays per step.
+pub(super) const MOST_RAYS: usize = 1 << 20;
 /// Samples per step of the instant preset.
 const SAMPLES_PER_STEP: f64 = 24576.0;
 /// Training samples per second and core, approximately.
