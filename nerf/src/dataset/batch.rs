@@ -45,10 +45,16 @@ impl Batch {
     ) -> Self {
         let mut batch = Batch::default();
         let pixels = Pixels::new(data);
-        for _ in 0..count {
-            let (number, pixel) = pixels.draw(data, rng);
+        // Pixels lie at random places of memory, so all are asked for before the first is read.
+        let drawn: Vec<_> = (0..count)
+            .map(|_| {
+                let (number, pixel) = pixels.draw(data, rng);
+                data.frames[number].image.prefetch(pixel[0], pixel[1]);
+                (number, pixel, background.draw(rng))
+            })
+            .collect();
+        for (number, pixel, color) in drawn {
             let frame = &data.frames[number];
-            let color = background.draw(rng);
             batch.rays.push_pixel(&frame.camera, pixel, bounds, [data.near, data.far]);
             batch.frames.push(number as u32);
             batch.pixels.push(pixel.map(|x| x as u32));

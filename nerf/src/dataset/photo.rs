@@ -7,6 +7,7 @@ use crate::error::{Error, Result};
 use crate::memory::{available_memory, gigabytes};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
+use raygrad_tensor::simd;
 use std::fs::File;
 use std::hash::{Hash, Hasher};
 use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
@@ -201,6 +202,16 @@ impl Photo {
             Values::Bytes(values) => rgba(&values[start..start + self.channels]),
             Values::Words(values) => rgba(&values[start..start + self.channels]),
             Values::Floats(values) => rgba(&values[start..start + self.channels]),
+        }
+    }
+
+    /// Asks for the memory of a pixel ahead of time.
+    pub(super) fn prefetch(&self, x: usize, y: usize) {
+        let place = (y * self.width + x) * self.channels;
+        match &self.values {
+            Values::Bytes(values) => simd::prefetch(values.as_ptr().wrapping_add(place)),
+            Values::Words(values) => simd::prefetch(values.as_ptr().wrapping_add(place)),
+            Values::Floats(values) => simd::prefetch(values.as_ptr().wrapping_add(place)),
         }
     }
 
