@@ -2,6 +2,7 @@
 
 mod accuracy;
 mod catalogue;
+mod conventions;
 mod formula;
 mod harness;
 mod one_way;
