@@ -91,6 +91,7 @@ impl<'t, T: Scalar> Sweep<'t, T> {
     }
 
     /// Passes the gradient of a node, if one has arrived, to its inputs.
+    #[inline(always)]
     fn visit(&mut self, place: usize) -> Result<(), Error> {
         let (tape, leads, checks) = (self.tape, self.path.leads(place), self.tape.checks_finite());
         if !(leads || checks) || self.arrived.get(place).is_none() {
@@ -120,6 +121,7 @@ impl<'t, T: Scalar> Sweep<'t, T> {
         Ok(())
     }
 
+    #[inline(always)]
     fn hand_on(&mut self, number: u32, node: &Node<T>, op: &dyn Op<T>, g: Var<'t, T>) -> Result<(), Error> {
         let tape = self.tape;
         let edges: SmallVec<[u32; 4]> = tape.nodes.with_edges(|edges| SmallVec::from_slice(edges.of(number)));
@@ -128,22 +130,17 @@ impl<'t, T: Scalar> Sweep<'t, T> {
         let (of_output, start, plain) = (g.node, tape.len() as u32, Cell::new(None));
         let cx = Vjp { tape, g, op: op.name(), edges: &edges, inputs, output, node: number, needs: &needs, plain };
         let given = differentiate(op, &cx, self.at)?.0;
-        let plain = cx.plain.get().filter(|_| tape.is_recording());
+        let plain = cx.plain.get();
         drop(cx);
         assert_eq!(given.len(), inputs.len(), "{}: as many gradients as inputs", op.name());
-        let unrecorded = |what| Err(Error::Unrecorded { op: op.name(), what, at });
-        match plain {
-            Some(i) if i < inputs.len() => return unrecorded(format!("`vjp` reads input {i} with `Vjp::input`")),
-            Some(_) => return unrecorded("`vjp` reads the output with `Vjp::output`".into()),
-            None => {}
+        if tape.is_recording() {
+            let outside = outside_of_the_tape(&given, &needs, plain, of_output, start);
+            outside.map_or(Ok(()), |what| Err(Error::Unrecorded { op: op.name(), what, at }))?;
         }
         for (i, share) in given.into_iter().enumerate() {
             let (Some(share), true) = (share, needs[i]) else { continue };
             let shape = inputs[i].shape();
             share.check(op.name(), i, shape, tape.is_recording());
-            if tape.is_recording() && !depends(&share, of_output, start) {
-                return unrecorded(format!("the gradient of input {i} does not depend on that of the output"));
-            }
             if tape.checks_finite() {
                 let mut alone = None;
                 Sum::gather(&mut alone, share.clone(), shape, tape);
@@ -191,6 +188,26 @@ impl<'t, T: Scalar> Arrived<'t, T> {
         self.free.push(slot);
         sum
     }
+}
+
+/// What an operation computed outside of the tape in a recorded pass, if anything. `plain` is the operand that it read
+/// as a tensor. Separate from the pass, which is faster then.
+#[inline(never)]
+fn outside_of_the_tape<T: Scalar>(
+    given: &[Option<Given<'_, T>>],
+    needs: &[bool],
+    plain: Option<usize>,
+    of_output: Option<u32>,
+    start: u32,
+) -> Option<String> {
+    match plain {
+        Some(i) if i < given.len() => return Some(format!("`vjp` reads input {i} with `Vjp::input`")),
+        Some(_) => return Some("`vjp` reads the output with `Vjp::output`".into()),
+        None => {}
+    }
+    let on_the_tape = |share: &Option<_>| share.as_ref().is_none_or(|share| depends(share, of_output, start));
+    let i = given.iter().zip(needs).position(|(share, needed)| *needed && !on_the_tape(share))?;
+    Some(format!("the gradient of input {i} does not depend on that of the output"))
 }
 
 /// Whether a gradient depends on node `g`, the gradient of the output, or is 0. A recorded vector-Jacobian product
