@@ -251,6 +251,7 @@ mod tests {
         assert_eq!(tiles(18, "--steps 100"), (8, Some(expected.to_owned())));
         assert_eq!(tiles(18, "--steps 100 --set sampler.tiles=20"), (20, None));
         assert_eq!(tiles(8, "--steps 100"), (8, None));
+        assert_eq!(tiles(18, "--steps 100 --batch-scale 2"), (16, None), "more tiles would be scaled too");
         assert_eq!(tiles(18, "--budget 1m"), (18, None));
         assert_eq!(tiles(18, "--budget 1m --batch-scale 2"), (36, None));
         assert_eq!(tiles(3, "--budget 1m"), (8, None));
