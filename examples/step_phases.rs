@@ -157,7 +157,7 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
         drop((x, params));
         tape.clear();
     }
-    let density = both - encode;
+    let density = (both - encode).max(0.0);
     let mut alone = Params::new();
     alone.add("table", model.params.get(id).clone());
     alone.set_lazy(|_| true, true);
