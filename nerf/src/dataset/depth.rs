@@ -2,6 +2,7 @@
 
 use super::formats::npy;
 use super::image::Image;
+use super::photo::unsupported::EXR;
 use super::photo::{Header, decoder_of};
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
@@ -46,6 +47,9 @@ fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
     if bytes.starts_with(npy::MAGIC) {
         let npy::Matrix { rows, columns, values } = npy::Matrix::read(&bytes).map_err(wrong)?;
         return Ok(([columns, rows], values));
+    }
+    if bytes.starts_with(EXR) {
+        return Err(wrong("is EXR, which raygrad does not decode: write depths as PNG of 16 bits or as .npy".into()));
     }
     let (decoder, _) = decoder_of(Cursor::new(&bytes), bytes.len() as u64, path)?;
     let decoded = DynamicImage::from_decoder(decoder);
@@ -248,6 +252,8 @@ mod tests {
         fails("absent.png", "");
         std::fs::write(folder.path().join("broken.png"), b"x").unwrap();
         fails("broken.png", "cannot be decoded");
+        std::fs::write(folder.path().join("0.exr"), [EXR, b"\x02\0\0\0"].concat()).unwrap();
+        fails("0.exr", "is EXR, which raygrad does not decode: write depths as PNG of 16 bits or as .npy");
         ImageBuffer::<Rgb<u8>, _>::new(3, 2).save(folder.path().join("color.png")).unwrap();
         fails("color.png", "has colour channels; use one channel of 8 or 16 bits, or a .npy array");
         ImageBuffer::<Luma<u8>, _>::new(2, 3).save(folder.path().join("turned.png")).unwrap();

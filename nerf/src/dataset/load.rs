@@ -34,8 +34,6 @@ const WHITE_BORDER: f64 = 0.98;
 const MOST_DOWNSCALE: u64 = 1 << 14;
 /// The least mask value of a used pixel.
 pub(super) const WHITE: f32 = 0.99;
-/// The least value of the brightest pixel of a mask. Programs that number objects write 1, 2, 3.
-const LEAST_WHITE: f32 = 0.1;
 
 /// Options of [`Capture::load`].
 #[derive(Clone, Copy)]
@@ -417,10 +415,9 @@ impl<'a> Plan<'a> {
             (given, lit) => given.map(Arc::new).or(lit),
         };
         if mask.as_ref().is_some_and(|mask| mask.used() == 0) {
-            return Err(Error::file(
-                path,
-                "has no usable pixel: all are masked or outside of the lens; correct its mask or remove it",
-            ));
+            let mask = view.mask.as_ref().map_or("no mask".to_owned(), |mask| format!("the mask `{}`", mask.display()));
+            let what = format!("has no usable pixel, by {mask} and the lens: correct the mask, or remove the image");
+            return Err(Error::file(path, what));
         }
         let camera = transform.camera(&camera);
         let measured = view.depth.as_ref().filter(|_| is_measured);
@@ -435,14 +432,25 @@ impl View {
         self.mask.is_some() && !self.mask_is_dynamic
     }
 
-    /// Reads the mask, if there is one, white for used pixels. `size` is that of [`Photo::open`].
+    /// Reads the mask, if there is one, as grey values: white for used pixels. `size` is that of [`Photo::open`].
+    ///
+    /// The brightest value counts as white, in any channel; transparent pixels are black.
     ///
     /// # Errors
-    /// As [`Photo::open`].
+    /// As [`Photo::open`], or if no value is close to white and several are not black.
     pub fn mask_photo(&self, size: Option<[usize; 2]>) -> Result<Option<Photo>> {
         let Some(path) = &self.mask else { return Ok(None) };
         let mask = Photo::open(path, size)?;
-        Ok(Some(if self.mask_is_dynamic { mask.inverted() } else { mask }))
+        if self.mask_is_dynamic {
+            return Ok(Some(mask.inverted()));
+        }
+        let mask = mask.into_mask().map_err(|most| {
+            let most = 255.0 * most;
+            let what =
+                format!("is brightest at {most:.1} of 255, with other values: write 255 (white) for pixels to use");
+            Error::file(path, what)
+        });
+        mask.map(Some)
     }
 
     /// Returns the most bytes of memory while the image, its mask and its depths are decoded; without those whose
@@ -528,25 +536,9 @@ pub(crate) fn mask_fits(mask: [usize; 2], image: [usize; 2]) -> bool {
     (mask[0] * image[1]).abs_diff(mask[1] * image[0]) <= longest
 }
 
-/// Opens the mask of a view, white for used pixels, in the orientation of the size `of`.
-pub(super) fn open_mask(view: &View, of: [usize; 2]) -> Result<Option<Photo>> {
-    let (Some(path), Some(mask)) = (&view.mask, view.mask_photo(Some(of))?) else { return Ok(None) };
-    // Transparent pixels are black, whatever their colour.
-    let mask = if mask.has_alpha() { mask.to_image().over([0.0; 3]).into() } else { mask };
-    let most = mask.pixels().map(|pixel| pixel[0]).fold(0.0, f32::max);
-    if most > 0.0 && most < LEAST_WHITE {
-        let what = format!(
-            "has values up to {:.0} of 255, so it uses no pixel: write 255 (white) for pixels to use",
-            (255.0 * most).max(1.0)
-        );
-        return Err(Error::file(path, what));
-    }
-    Ok(Some(mask))
-}
-
 /// Reads the mask of an image of the size `of`, resampled to the size `to`.
 fn read_mask(view: &View, of: [usize; 2], to: [usize; 2]) -> Result<Option<Photo>> {
-    let (Some(path), Some(mask)) = (&view.mask, open_mask(view, of)?) else { return Ok(None) };
+    let (Some(path), Some(mask)) = (&view.mask, view.mask_photo(Some(of))?) else { return Ok(None) };
     let from = [mask.width, mask.height];
     if !mask_fits(from, of) {
         let what =

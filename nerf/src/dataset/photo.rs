@@ -83,11 +83,15 @@ impl Photo {
     /// Without such a profile colours [count as sRGB](Self::has_unread_profile).
     ///
     /// # Errors
-    /// If the file cannot be read or decoded, or claims more than 2^28 pixels or more than 64 MiB plus 16 KiB per byte
-    /// of the file, or needs more memory than is free. The error names it.
+    /// If the file cannot be read or decoded, or ends within its pixels. If it claims more than 2^28 pixels or more than
+    /// 64 MiB plus 16 KiB per byte of the file, or needs more memory than is free. The error names it.
     pub fn open(path: impl AsRef<Path>, size: Option<[usize; 2]>) -> Result<Self> {
         let path = path.as_ref();
         let (mut decoder, stored) = decoder_within_memory(path)?;
+        if is_cut_jpeg(path)? {
+            let what = "ends within its pixels: copy it again, or save it again with another program";
+            return Err(Error::file(path, what));
+        }
         let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
         let profile = Profile::of(&mut decoder);
         let decoded = DynamicImage::from_decoder(decoder);
@@ -283,7 +287,22 @@ impl Photo {
         self
     }
 
-    /// Multiplies alpha by the red values of a mask of the same size, so that its black pixels become transparent.
+    /// Converts a mask to grey values whose brightest is white. Transparent pixels become black. A mask may have one value
+    /// besides black, such as the number or the colour of an object.
+    ///
+    /// # Errors
+    /// With the brightest value, if it is far from white and not the only one besides black: programs that number objects
+    /// write 1, 2, 3.
+    pub(super) fn into_mask(mut self) -> std::result::Result<Photo, f32> {
+        match &mut self.values {
+            Values::Bytes(values) => whiten(values, self.channels),
+            Values::Words(values) => whiten(values, self.channels),
+            Values::Floats(values) => whiten(values, self.channels),
+        }?;
+        Ok(self)
+    }
+
+    /// Multiplies alpha by the values of a [mask](Self::into_mask) of the same size: its black pixels become transparent.
     pub(super) fn masked(&self, mask: &Photo) -> Photo {
         let alpha = mask.pixels().map(|pixel| pixel[0]);
         let values = match &self.values {
@@ -302,6 +321,33 @@ fn invert<S: Stored>(values: &mut [S], channels: usize) {
         pixel.fill(S::nearest(f64::from(u8::from(is_used))));
         pixel[3..].fill(S::nearest(1.0));
     }
+}
+
+/// The least value of the brightest pixel of a mask with grey values.
+const LEAST_WHITE: f32 = 0.9;
+
+/// Makes all pixels grey and opaque, and the brightest white; or returns its value, as [`Photo::into_mask`] does.
+fn whiten<S: Stored>(values: &mut [S], channels: usize) -> std::result::Result<(), f32> {
+    let brightness = |pixel: &[S]| {
+        let [red, green, blue, alpha] = rgba(pixel);
+        red.max(green).max(blue) * alpha
+    };
+    let all = || values.chunks_exact(channels).map(brightness);
+    let most = all().fold(0.0, f32::max);
+    let is_binary = all().any(|value| value == 0.0) && all().all(|value| value == 0.0 || value == most);
+    if most < LEAST_WHITE && !is_binary {
+        return Err(most);
+    }
+    for pixel in values.chunks_exact_mut(channels) {
+        let value = brightness(pixel);
+        pixel.fill(S::nearest(f64::from(if value == most && most > 0.0 {
+            1.0
+        } else {
+            value / most.max(LEAST_WHITE)
+        })));
+        pixel[3..].fill(S::nearest(1.0));
+    }
+    Ok(())
 }
 
 /// RGBA of pixels, with their alpha times another.
@@ -453,6 +499,9 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
         return Err(Error::file(path, what));
     }
     let mut reader = ImageReader::new(reader).with_guessed_format().map_err(unread)?;
+    if !matches!(reader.format(), Some(ImageFormat::Png | ImageFormat::Jpeg | ImageFormat::WebP)) {
+        return Err(bad("it is no PNG, JPEG or WebP file: convert it".into()));
+    }
     if reader.format() == Some(ImageFormat::WebP) {
         let mut inner = reader.into_inner();
         if !chunks_fit(&mut inner, length).map_err(unread)? {
@@ -470,6 +519,27 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
         return Err(bad(format!("{width}x{height} pixels cannot come from {length} bytes: copy it again")));
     }
     Ok((decoder, size))
+}
+
+/// Returns true for a JPEG file without the marker that ends its pixels: decoders invent the rest.
+fn is_cut_jpeg(path: &Path) -> Result<bool> {
+    let (start, _) = start_of(path)?;
+    if !start.starts_with(JPEG) {
+        return Ok(false);
+    }
+    let bytes = std::fs::read(path).map_err(|e| Error::file(path, format!("cannot be read: {e}")))?;
+    let mut at = 2;
+    // Segments start with a marker and their length. Pixels between them have no markers but those of restarts.
+    let is_marker = |pair: &[u8]| pair[0] == 0xff && !matches!(pair[1], 0 | 1 | 0xff | 0xd0..=0xd8);
+    while let Some(found) = bytes.get(at..).and_then(|rest| rest.windows(2).position(is_marker)) {
+        at += found + 2;
+        match bytes.get(at..at + 2) {
+            _ if bytes[at - 1] == 0xd9 => return Ok(false),
+            Some(&[high, low]) => at += usize::from(u16::from_be_bytes([high, low])),
+            _ => break,
+        }
+    }
+    Ok(true)
 }
 
 /// Returns true if the chunks of a WebP file fit into `length` bytes: the decoder allocates as much memory as a chunk's

@@ -2,7 +2,7 @@
 
 use super::capture::View;
 use super::image::Image;
-use super::load::{WHITE, open, open_mask, size_for};
+use super::load::{WHITE, open, size_for};
 use super::photo::Photo;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -119,7 +119,7 @@ impl View {
         };
         let photo = moved(&open(image, &self.camera)?);
         let mask = match &self.mask {
-            Some(path) => open_mask(self, size_for(path, &self.camera)?)?,
+            Some(path) => self.mask_photo(Some(size_for(path, &self.camera)?))?,
             None => None,
         };
         let Some(mask) = mask.map(|mask| moved(&mask)) else { return Ok((photo, None)) };

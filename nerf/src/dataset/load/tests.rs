@@ -580,7 +580,36 @@ fn transparent_pixels_of_a_mask_are_black_at_each_size() {
 }
 
 #[test]
-fn faint_masks_are_refused_by_name() {
+fn brightest_value_of_a_mask_is_white() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("mask.png");
+    let view =
+        View { mask: Some(path.clone()), ..View::new("", "", Camera::from_angle(3, 1, 0.8, DAffine3::IDENTITY)) };
+    let read = |channels: usize, values: &[u8]| {
+        let data = values.iter().map(|value| f32::from(*value) / 255.0).collect();
+        Image { width: 3, height: 1, channels, data }.save_png(&path).unwrap();
+        let mask = view.mask_photo(None).map_err(|error| error.to_string())?;
+        Ok::<_, String>(mask.unwrap().pixels().map(|pixel| (255.0 * pixel[0]).round() as u8).collect::<Vec<_>>())
+    };
+    // One value besides black, of any channel and size, is white.
+    for value in [1, 40, 128, 200, 255] {
+        assert_eq!(read(1, &[0, value, value]).unwrap(), [0, 255, 255], "{value}");
+        assert_eq!(read(3, &[0, 0, 0, 0, value, 0, value, 0, 0]).unwrap(), [0, 255, 255], "{value}");
+        assert_eq!(read(4, &[9, 9, 9, 0, 0, value, 0, 255, 0, 0, 0, 255]).unwrap(), [0, 255, 0], "{value}");
+    }
+    assert_eq!(read(1, &[0, 0, 0]).unwrap(), [0; 3]);
+    assert_eq!(read(1, &[0, 120, 240]).unwrap(), [0, 128, 255]);
+    assert_eq!(read(1, &[240; 3]).unwrap(), [255; 3]);
+    // Numbers of objects, and grey alone, do not say which pixels to use.
+    for (values, most) in [([0, 1, 2], "2.0"), ([0, 100, 200], "200.0"), ([128; 3], "128.0"), ([1; 3], "1.0")] {
+        let expected = format!("mask.png: is brightest at {most} of 255, with other values: write 255");
+        let message = read(1, &values).unwrap_err();
+        assert!(message.contains(&expected), "{message}");
+    }
+}
+
+#[test]
+fn masks_without_white_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
     capture.split_by_default();
@@ -588,18 +617,21 @@ fn faint_masks_are_refused_by_name() {
     let analysis = capture.analyze_scene(None).unwrap();
     capture.views.iter_mut().for_each(|view| view.mask = Some(path.clone()));
     let view = capture.views.iter().find(|view| view.image.is_some()).unwrap();
-    for (value, is_faint) in [(1, true), (3, true), (25, true), (26, false), (255, false)] {
-        let data = (0..96).map(|i| if i < 40 { f32::from(value as u8) / 255.0 } else { 0.0 }).collect();
+    let load = |mask_as_alpha| {
+        capture.load(Split::Train, &analysis, &LoadOptions { mask_as_alpha, ..LoadOptions::default() }).map(drop)
+    };
+    for (others, is_refused) in [(0.0, false), (0.2, true)] {
+        let data = (0..96).map(|i| if i < 40 { 0.5 } else { others }).collect();
         Image { width: 12, height: 8, channels: 1, data }.save_png(&path).unwrap();
-        let expected = format!("mask.png: has values up to {value} of 255, so it uses no pixel: write 255");
-        let load = |mask_as_alpha| {
-            capture.load(Split::Train, &analysis, &LoadOptions { mask_as_alpha, ..LoadOptions::default() }).map(drop)
-        };
         for read in [load(false), load(true), view.seen_by(&view.camera.resized(12, 8)).map(drop)] {
-            assert!(!is_faint || read.unwrap_err().to_string().contains(&expected), "{value}");
+            let message = read.map_or_else(|error| error.to_string(), |()| String::new());
+            assert_eq!(message.contains("mask.png: is brightest at 128.0 of 255"), is_refused, "{message}");
         }
-        assert!(is_faint || load(true).is_ok(), "{value}");
     }
+    // A mask that uses nothing is named beside its image.
+    Image { width: 12, height: 8, channels: 1, data: vec![0.0; 96] }.save_png(&path).unwrap();
+    let message = load(false).unwrap_err().to_string();
+    assert!(message.contains("has no usable pixel, by the mask `") && message.contains("mask.png`"), "{message}");
 }
 
 #[test]

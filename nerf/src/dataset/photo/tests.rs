@@ -117,6 +117,30 @@ fn formats_are_detected_by_content() {
 }
 
 #[test]
+fn jpeg_that_ends_within_its_pixels_is_an_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("cut.jpg");
+    let open = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        Photo::open(&path, None).map(drop).map_err(|error| error.to_string())
+    };
+    let noise = image::RgbImage::from_fn(64, 48, |x, y| image::Rgb([(x * x * 31 + y * y * 17 + x * y) as u8; 3]));
+    let mut plain = vec![];
+    noise.write_to(&mut Cursor::new(&mut plain), ImageFormat::Jpeg).unwrap();
+    // A thumbnail in EXIF has an end of its own.
+    let thumbnail = [&[0xff, 0xe1, 0, 8, 0xff, 0xd9][..], b"more"].concat();
+    let with_thumbnail = [&plain[..2], &thumbnail[..8 + 2], &plain[2..]].concat();
+    for whole in [&plain, &with_thumbnail] {
+        assert_eq!(open(whole), Ok(()));
+        assert_eq!(open(&[whole, &b"a video behind the image"[..]].concat()), Ok(()));
+        for end in [whole.len() / 2, whole.len() - 300, whole.len() - 2, whole.len() - 1] {
+            let message = open(&whole[..end]).unwrap_err();
+            assert!(message.contains("cut.jpg: ends within its pixels: copy it again"), "{end}: {message}");
+        }
+    }
+}
+
+#[test]
 fn oversized_header_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("picture.png");

@@ -8,6 +8,8 @@ use std::path::Path;
 /// The brands of still images in ISO base media files: HEIC, other HEIF and AVIF.
 const BRANDS: [&[u8; 4]; 12] =
     [b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"mif2", b"mif3", b"msf1", b"avif", b"avis"];
+/// The first bytes of an EXR file.
+pub(in crate::dataset) const EXR: &[u8] = b"\x76\x2f\x31\x01";
 /// The transfer curves of high dynamic range in `cICP` (ITU-T H.273): perceptual quantisation and hybrid log-gamma.
 const HDR: [(u8, &str); 2] = [(16, "PQ"), (18, "HLG")];
 
@@ -43,12 +45,21 @@ fn is_heif(start: &[u8]) -> bool {
 /// the start, before and after.
 pub(super) fn refusal(reader: &mut (impl BufRead + Seek)) -> IoResult<Option<String>> {
     let start = reader.fill_buf()?;
+    for (is_so, what) in [
+        (start.is_empty(), "is empty: copy it again"),
+        (start.starts_with(b"version https://git-lfs"), "is a pointer of Git LFS: run `git lfs pull`"),
+        (start.trim_ascii_start().starts_with(b"<"), "is a page of HTML or XML, not an image: download it again"),
+    ] {
+        if is_so {
+            return Ok(Some(what.to_owned()));
+        }
+    }
     if is_heif(start) {
         let what = "is HEIC or AVIF, which `raygrad prepare` converts: in a capture with poses, convert it with \
                     `heif-convert 0.heic 0.jpg` and name the JPEG";
         return Ok(Some(what.to_owned()));
     }
-    if start.starts_with(b"\x76\x2f\x31\x01") {
+    if start.starts_with(EXR) {
         let what = "is EXR, which raygrad does not decode: convert it with `ffmpeg -apply_trc iec61966_2_1 -i 0.exr \
                     0.png`, which clips values above 1";
         return Ok(Some(what.to_owned()));
@@ -126,6 +137,24 @@ mod tests {
         for error in [Photo::open(&path, None).err(), Photo::size_of_file(&path).err()] {
             let message = error.unwrap().to_string();
             assert!(message.contains("0.jpg: is HEIC or AVIF") && message.contains("raygrad prepare"), "{message}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_image_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("0.jpg");
+        for (bytes, expected) in [
+            (&b""[..], "is empty: copy it again"),
+            (b"version https://git-lfs.github.com/spec/v1\noid", "is a pointer of Git LFS: run `git lfs pull`"),
+            (b"\n<!DOCTYPE html><html>", "is a page of HTML or XML, not an image: download it again"),
+            (b"II*\0\x08\0\0\0", "is no PNG, JPEG or WebP file: convert it"),
+        ] {
+            std::fs::write(&path, bytes).unwrap();
+            for message in [Photo::open(&path, None).err(), Photo::size_of_file(&path).err()] {
+                let message = message.unwrap().to_string();
+                assert!(message.contains("0.jpg: ") && message.contains(expected), "{message}");
+            }
         }
     }
 
