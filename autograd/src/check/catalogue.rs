@@ -171,7 +171,8 @@ fn choices() -> Vec<Entry> {
 /// Reductions, and operations along an axis.
 fn reductions() -> Vec<Entry> {
     let shape = |extents: &[usize]| Shape::from_slice(extents);
-    let variance = |extents: &[usize], correction| moments::Variance { shape: shape(extents), correction };
+    let variance =
+        |extents: &[usize], correction, root| Entry::new(moments::Variance { shape: shape(extents), correction, root });
     let extremum = |from, behind, greatest| {
         // Far enough apart for the steps of differences.
         let apart = |extents: &[usize]| Tensor::from_fn(extents, |i| ((i * 7 + 3) % 24) as f64 * 0.1 - 1.0);
@@ -189,15 +190,13 @@ fn reductions() -> Vec<Entry> {
         extremum(1, 3, true),
         extremum(0, 2, false),
         extremum(1, 1, true),
-        Entry::new(moments::Variance { correction: 1.0, ..variance(&[2, 1], 0.0) })
-            .sample(&[&[2, 5]])
-            .sample(&[&[2, 40]]),
-        Entry::new(variance(&[1, 3, 1], 0.0)).sample(&[&[2, 3, 4]]).sample(&[&[5, 3, 1]]),
-        Entry::new(variance(&[], 0.0)).sample(&[&[]]),
-        Entry::new(variance(&[0, 1], 0.0)).sample(&[&[0, 4]]),
+        variance(&[2, 1], 1.0, false).sample(&[&[2, 5]]).sample(&[&[2, 40]]),
+        variance(&[1, 3, 1], 0.0, false).sample(&[&[2, 3, 4]]).sample(&[&[5, 3, 1]]),
+        variance(&[], 0.0, false).sample(&[&[]]),
+        variance(&[0, 1], 0.0, false).sample(&[&[0, 4]]),
         Entry::examined(moments::Ratio),
-        Entry::new(moments::Deviation(variance(&[2, 1], 1.0))).sample(&[&[2, 5]]).sample(&[&[2, 40]]),
-        Entry::new(moments::Deviation(variance(&[1, 3, 1], 0.0))).sample(&[&[2, 3, 4]]),
+        variance(&[2, 1], 1.0, true).sample(&[&[2, 5]]).sample(&[&[2, 40]]),
+        variance(&[1, 3, 1], 0.0, true).sample(&[&[2, 3, 4]]),
         Entry::new(moments::Norm { shape: shape(&[2, 1]) }).sample(&[&[2, 5]]).sample(&[&[2, 40]]),
         Entry::new(moments::Norm { shape: shape(&[1, 3]) }).sample(&[&[4, 3]]),
         Entry::new(moments::Norm { shape: shape(&[]) }).sample(&[&[]]),
@@ -224,13 +223,17 @@ fn reductions() -> Vec<Entry> {
             .sample_of(zeros(&[2, 5], 2))
             .sample(&[&[2, 0]])
             .sample(&[&[1]]),
-        Entry::new(softmax::Softmax)
+        Entry::new(softmax::Softmax { log: false })
             .sample(&[&[2, 5]])
             .sample(wide)
             .sample(&[&[0, 3]])
             .sample(&[&[2, 0]])
             .sample(&[&[1]]),
-        Entry::new(softmax::LogSoftmax).sample(&[&[2, 5]]).sample(wide).sample(&[&[0, 3]]).sample(&[&[2, 0]]),
+        Entry::new(softmax::Softmax { log: true })
+            .sample(&[&[2, 5]])
+            .sample(wide)
+            .sample(&[&[0, 3]])
+            .sample(&[&[2, 0]]),
         Entry::new(softmax::LogSumExp).sample(&[&[2, 5]]).sample(wide).sample(&[&[0, 3]]).sample(&[&[3]]),
         Entry::new(layer_norm::LayerNorm { eps: 1e-3 })
             .sample(&[&[3, 5], &[5], &[5]])
@@ -259,6 +262,7 @@ fn core() -> Vec<Entry> {
         from: Shape::from_slice(from),
         layout: layout(Layout::contiguous(from)),
     };
+    let sum = |extents: &[usize], mean| reduce::SumTo { shape: shape(extents), mean };
     let cumsum = |exclusive, reverse| segment::SegmentCumsum { segments: segments(), exclusive, reverse };
     let mut entries = vec![
         Entry::new(arithmetic::IfPositive).sample(&[&[2, 3], &[2, 3], &[3]]).sample(&[&[4], &[], &[4]]),
@@ -270,10 +274,10 @@ fn core() -> Vec<Entry> {
             .sample(&[&[5, 3], &[3, 4], &[4]])
             .sample(&[&[2, 5, 3], &[3, 4]])
             .sample(&[&[0, 3], &[3, 4], &[4]]),
-        Entry::new(reduce::SumTo { shape: shape(&[]) }).linear().sample(&[&[2, 3]]).sample(&[&[]]).sample(&[&[0, 2]]),
-        Entry::new(reduce::SumTo { shape: shape(&[3, 1]) }).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
-        Entry::new(reduce::MeanTo { shape: shape(&[]) }).linear().sample(&[&[2, 3]]).sample(&[&[]]),
-        Entry::new(reduce::MeanTo { shape: shape(&[3, 1]) }).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
+        Entry::new(sum(&[], false)).linear().sample(&[&[2, 3]]).sample(&[&[]]).sample(&[&[0, 2]]),
+        Entry::new(sum(&[3, 1], false)).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
+        Entry::new(sum(&[], true)).linear().sample(&[&[2, 3]]).sample(&[&[]]),
+        Entry::new(sum(&[3, 1], true)).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
         Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]) }).linear().sample(&[&[3, 1]]).sample(&[&[]]),
         Entry::new(shape::Reshape { shape: shape(&[3, 2]) }).linear().sample(&[&[2, 3]]).sample(&[&[6]]),
         Entry::new(view(&[2, 3, 4], |layout| layout.permuted(&[2, 0, 1]))).linear().sample(&[&[2, 3, 4]]),

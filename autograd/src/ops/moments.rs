@@ -42,22 +42,17 @@ fn check_kept(x: &[usize], to: &[usize]) -> Result<Shape, ShapeError> {
 }
 
 /// y = the variance over the axes along which `shape` has extent 1: the sum of squared deviations from the mean,
-/// divided by `n - correction`. dx = 2 g (x - mean) / (n - correction).
+/// divided by `n - correction`. dx = 2 g (x - mean) / (n - correction). Its square root is also right where the
+/// variance is out of range. The root has dx = g (x - mean) / (y (n - correction)), 0 where y is 0.
 #[derive(Clone)]
 pub struct Variance {
     /// The shape of the output, with as many axes as the input.
     pub shape: Shape,
     /// Subtracted from the number of elements.
     pub correction: f64,
+    /// Whether to take the square root.
+    pub root: bool,
 }
-
-/// y = the square root of [`Variance`], also where that is out of range; dx = g (x - mean) / (y (n - correction)), 0
-/// where y is 0.
-#[derive(Clone)]
-pub struct Deviation(
-    /// The variance.
-    pub Variance,
-);
 
 impl Variance {
     /// `n - correction` for an input of shape `x`.
@@ -65,11 +60,29 @@ impl Variance {
         let [from, to] = [x, &self.shape].map(|shape| shape.iter().product::<usize>() as f64);
         (from / to - self.correction).max(0.0)
     }
+
+    /// The gradient of the square root.
+    fn root_vjp<'t, T: Scalar>(&self, cx: &Vjp<'t, '_, T>) -> Var<'t, T> {
+        let (shape, x, y) = (&self.shape, cx.x(0), cx.y());
+        let divisor = self.divisor(cx.shape(0));
+        let quotient =
+            |x: Var<'t, T>, y: Var<'t, T>| Ratio.on([cx.g(), &x.centred(shape), &(unless_zero(&y) * divisor)]);
+        let is_safe = |y: T| (1e-25..1e25).contains(&y.to_f64());
+        let factor = if y.value().iter().all(is_safe) { None } else { middle(&x, shape, cx.pool()) };
+        match factor {
+            None => quotient(x, y),
+            Some(factor) => {
+                let x = x * factor;
+                let y = x.tape().apply(self.clone(), &[&x]);
+                quotient(x, y)
+            }
+        }
+    }
 }
 
 impl<T: Scalar> Op<T> for Variance {
     fn name(&self) -> &'static str {
-        "var"
+        if self.root { "std" } else { "var" }
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
@@ -77,50 +90,22 @@ impl<T: Scalar> Op<T> for Variance {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        variance_to(x[0], &self.shape, self.correction, false, pool)
+        variance_to(x[0], &self.shape, self.correction, self.root, pool)
+    }
+
+    fn reads(&self) -> Reads {
+        if self.root { Reads::ALL } else { Reads::INPUTS }
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        if self.root {
+            return Grads::one(self.root_vjp(cx));
+        }
         let half = cx.g().constant(0.5 * self.divisor(cx.shape(0)));
         let x = cx.x(0);
         Grads::one(match middle(&x, &self.shape, cx.pool()) {
             None => Ratio.on([cx.g(), &x.centred(&self.shape), &half]),
             Some(factor) => Ratio.on([cx.g(), &(x * &factor).centred(&self.shape), &(half * factor)]),
-        })
-    }
-}
-
-impl<T: Scalar> Op<T> for Deviation {
-    fn name(&self) -> &'static str {
-        "std"
-    }
-
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        check_kept(x[0], &self.0.shape)
-    }
-
-    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        variance_to(x[0], &self.0.shape, self.0.correction, true, pool)
-    }
-
-    fn reads(&self) -> Reads {
-        Reads::ALL
-    }
-
-    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (shape, x, y) = (&self.0.shape, cx.x(0), cx.y());
-        let divisor = self.0.divisor(cx.shape(0));
-        let quotient =
-            |x: Var<'t, T>, y: Var<'t, T>| Ratio.on([cx.g(), &x.centred(shape), &(unless_zero(&y) * divisor)]);
-        let is_safe = |y: T| (1e-25..1e25).contains(&y.to_f64());
-        let factor = if y.value().iter().all(is_safe) { None } else { middle(&x, shape, cx.pool()) };
-        Grads::one(match factor {
-            None => quotient(x, y),
-            Some(factor) => {
-                let x = x * factor;
-                let y = x.tape().apply(self.clone(), &[&x]);
-                quotient(x, y)
-            }
         })
     }
 }
@@ -216,7 +201,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn var_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
         let axes = self.axes("var_over", axes);
-        let op = Variance { shape: axes.kept(), correction: correction as f64 };
+        let op = Variance { shape: axes.kept(), correction: correction as f64, root: false };
         self.tape().apply(op, &[self]).reshape(&axes.result())
     }
 
@@ -234,7 +219,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn std_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
         let axes = self.axes("std_over", axes);
-        let op = Deviation(Variance { shape: axes.kept(), correction: correction as f64 });
+        let op = Variance { shape: axes.kept(), correction: correction as f64, root: true };
         self.tape().apply(op, &[self]).reshape(&axes.result())
     }
 

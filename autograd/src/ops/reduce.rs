@@ -4,39 +4,30 @@ use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::Reduction;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, mean_to, sum_to};
 
-/// y = x summed over the axes along which `shape` broadcasts to the shape of x; dx = g broadcast.
+/// y = x summed over the axes along which `shape` broadcasts to the shape of x; dx = g broadcast. The mean is the sum
+/// divided by the number of summands, and so is its gradient. The mean overflows only if the mean itself does.
 #[derive(Clone)]
 pub struct SumTo {
     /// The shape of the output, which broadcasts to the shape of the input.
     pub shape: Shape,
-}
-
-/// y = [`SumTo`] divided by the number of elements; dx = g broadcast, divided by it. It overflows only if the mean does.
-#[derive(Clone)]
-pub struct MeanTo {
-    /// The shape of the output, which broadcasts to the shape of the input.
-    pub shape: Shape,
-}
-
-/// The shape `to`, if a tensor of shape `x` can be summed to it.
-fn summed(x: &[usize], to: &Shape) -> Result<Shape, ShapeError> {
-    match broadcast_shape(&[x, to]) {
-        Some(wide) if wide.as_slice() == x => Ok(to.clone()),
-        _ => Err(format!("cannot be summed to {to:?}")),
-    }
+    /// Divides by the number of summands.
+    pub mean: bool,
 }
 
 impl<T: Scalar> Op<T> for SumTo {
     fn name(&self) -> &'static str {
-        "sum"
+        if self.mean { "mean" } else { "sum" }
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        summed(x[0], &self.shape)
+        match broadcast_shape(&[x[0], &self.shape]) {
+            Some(wide) if wide.as_slice() == x[0] => Ok(self.shape.clone()),
+            _ => Err(format!("cannot be summed to {:?}", self.shape)),
+        }
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        sum_to(x[0], &self.shape, pool)
+        if self.mean { mean_to(x[0], &self.shape, pool) } else { sum_to(x[0], &self.shape, pool) }
     }
 
     fn reads(&self) -> Reads {
@@ -44,28 +35,9 @@ impl<T: Scalar> Op<T> for SumTo {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(cx.g().broadcast_to(cx.shape(0)))
-    }
-}
-
-impl<T: Scalar> Op<T> for MeanTo {
-    fn name(&self) -> &'static str {
-        "mean"
-    }
-
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        summed(x[0], &self.shape)
-    }
-
-    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        mean_to(x[0], &self.shape, pool)
-    }
-
-    fn reads(&self) -> Reads {
-        Reads::NOTHING
-    }
-
-    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        if !self.mean {
+            return Grads::one(cx.g().broadcast_to(cx.shape(0)));
+        }
         let [from, to] = [cx.shape(0), &self.shape].map(|shape| shape.iter().product::<usize>() as f64);
         Grads::one((cx.g() / (from / to)).broadcast_to(cx.shape(0)))
     }
@@ -148,7 +120,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The mean over the axes along which `shape` broadcasts to the shape of this tensor.
     #[track_caller]
     pub(crate) fn mean_to(&self, shape: &[usize]) -> Self {
-        self.tape().apply(MeanTo { shape: shape.into() }, &[self])
+        self.tape().apply(SumTo { shape: shape.into(), mean: true }, &[self])
     }
 
     /// `[kept elements, reduced elements]`, with the reduced axes moved to the end.
@@ -170,7 +142,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         if self.shape() == shape {
             return self.clone();
         }
-        self.tape().apply(SumTo { shape: shape.into() }, &[self])
+        self.tape().apply(SumTo { shape: shape.into(), mean: false }, &[self])
     }
 
     /// Broadcasts this tensor to `shape`, with NumPy's rules.

@@ -31,13 +31,17 @@ fn by_rows<T: Scalar>(x: &Tensor<T>, pool: &Pool<T>, kernel: impl FnOnce(&[T], u
     out
 }
 
-/// y = e^(x - max) / sum e^(x - max) along the last axis; dx = y (g - sum g y).
+/// y = e^(x - max) / sum e^(x - max) along the last axis; dx = y (g - sum g y). The logarithm of it is
+/// y = x - max - ln sum e^(x - max), with dx = g - e^y sum g.
 #[derive(Clone, Copy)]
-pub struct Softmax;
+pub struct Softmax {
+    /// Whether to take the logarithm.
+    pub log: bool,
+}
 
 impl<T: Scalar> Op<T> for Softmax {
     fn name(&self) -> &'static str {
-        "softmax"
+        if self.log { "log_softmax" } else { "softmax" }
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
@@ -45,7 +49,8 @@ impl<T: Scalar> Op<T> for Softmax {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        by_rows(x[0], pool, |x, n, out| rows::softmax_rows(x, n, out, pool))
+        let kernel = if self.log { rows::log_softmax_rows::<T> } else { rows::softmax_rows::<T> };
+        by_rows(x[0], pool, |x, n, out| kernel(x, n, out, pool))
     }
 
     fn reads(&self) -> Reads {
@@ -55,50 +60,21 @@ impl<T: Scalar> Op<T> for Softmax {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (y, g) = (cx.y(), cx.g());
         if cx.recording() {
-            return Grads::one(&y * (g - (g * &y).sum_over(kept_last())));
+            return Grads::one(if self.log {
+                g - power_times(&y, &g.sum_over(kept_last()))
+            } else {
+                &y * (g - (g * &y).sum_over(kept_last()))
+            });
         }
+        let kernel = if self.log { rows::log_softmax_rows_grad::<T> } else { rows::softmax_rows_grad::<T> };
         let g = g.value().as_slice();
-        Grads::one(cx.constant(by_rows(y.value(), cx.pool(), |y, n, out| rows::softmax_rows_grad(y, g, n, out))))
+        Grads::one(cx.constant(by_rows(y.value(), cx.pool(), |y, n, out| kernel(y, g, n, out))))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         let powers = x[0].exp();
-        Some(&powers / powers.sum_over(kept_last()))
-    }
-}
-
-/// y = x - max - ln sum e^(x - max) along the last axis; dx = g - e^y sum g.
-#[derive(Clone, Copy)]
-pub struct LogSoftmax;
-
-impl<T: Scalar> Op<T> for LogSoftmax {
-    fn name(&self) -> &'static str {
-        "log_softmax"
-    }
-
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        Ok(last_axis(x[0])?.0)
-    }
-
-    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        by_rows(x[0], pool, |x, n, out| rows::log_softmax_rows(x, n, out, pool))
-    }
-
-    fn reads(&self) -> Reads {
-        Reads::OUTPUT
-    }
-
-    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (y, g) = (cx.y(), cx.g());
-        if cx.recording() {
-            return Grads::one(g - power_times(&y, &g.sum_over(kept_last())));
-        }
-        let g = g.value().as_slice();
-        Grads::one(cx.constant(by_rows(y.value(), cx.pool(), |y, n, out| rows::log_softmax_rows_grad(y, g, n, out))))
-    }
-
-    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        Some(&x[0] - x[0].exp().sum_over(kept_last()).ln())
+        let sum = powers.sum_over(kept_last());
+        Some(if self.log { &x[0] - sum.ln() } else { &powers / sum })
     }
 }
 
@@ -182,7 +158,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist.
     #[track_caller]
     pub fn softmax(&self, axis: isize) -> Self {
-        self.along(axis, Softmax)
+        self.along(axis, Softmax { log: false })
     }
 
     /// The logarithm of [`softmax`](Self::softmax) along `axis`. Accurate even where the softmax underflows.
@@ -191,7 +167,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist.
     #[track_caller]
     pub fn log_softmax(&self, axis: isize) -> Self {
-        self.along(axis, LogSoftmax)
+        self.along(axis, Softmax { log: true })
     }
 
     /// `ln(sum(e^self))` of all elements, as a scalar; see [`logsumexp_over`](Self::logsumexp_over).

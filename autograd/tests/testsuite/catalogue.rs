@@ -46,8 +46,9 @@ fn no_operation_is_missing() {
             let name =
                 line.trim().strip_prefix("const NAME: &'static str = \"").and_then(|rest| rest.strip_suffix("\";"));
             let method = (line.trim() == "fn name(&self) -> &'static str {").then(|| lines.peek()).flatten();
-            let method = method.and_then(|line| line.trim().strip_prefix('"')?.strip_suffix('"'));
-            written.extend(name.or(method).map(String::from));
+            // An operation with a flag has two names.
+            let method = method.into_iter().flat_map(|line| line.split('"').skip(1).step_by(2));
+            written.extend(name.into_iter().chain(method).map(String::from));
             // Those of an operation and of its adjoint.
             let names = line.split_once("names: [\"").and_then(|(_, rest)| rest.split_once("\"]"));
             written.extend(names.into_iter().flat_map(|(names, _)| names.split("\", \"")).map(String::from));
