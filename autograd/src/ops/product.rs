@@ -1,6 +1,6 @@
 //! The product of the elements of each row, without overflow or underflow of partial products.
 
-use super::scan::{Cumprod, Walk};
+use super::scan::{Cumprod, Running, Walk};
 use crate::{Axes, Grads, Op, ShapeError, Var, Vjp};
 use raygrad_tensor::scale::power_of_two;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
@@ -163,13 +163,6 @@ impl Unbounded {
         x.abs() > 1.0 / END && x.abs() < END
     }
 
-    /// The product with a number.
-    #[inline(always)]
-    pub fn times(self, x: f64) -> Self {
-        let factor = self.factor * x;
-        if Unbounded::is_in_the_middle(factor) { Unbounded { factor, ..self } } else { self.times_any(x) }
-    }
-
     #[inline(never)]
     fn times_any(self, x: f64) -> Self {
         if self.factor == 0.0 || x == 0.0 || !self.factor.is_finite() || !x.is_finite() {
@@ -177,24 +170,6 @@ impl Unbounded {
         }
         let ((a, up), (b, up_too)) = (split(self.factor), split(x));
         Unbounded { factor: a * b, exponent: self.exponent + up + up_too }
-    }
-
-    /// The product of two.
-    #[inline(always)]
-    pub fn product(self, other: Self) -> Self {
-        let product = self.times(other.factor);
-        Unbounded { exponent: product.exponent + other.exponent, ..product }
-    }
-
-    /// The sum.
-    #[inline(always)]
-    pub fn plus(self, other: Self) -> Self {
-        let factor = self.factor + other.factor;
-        if self.exponent == other.exponent && Unbounded::is_in_the_middle(factor) {
-            Unbounded { factor, ..self }
-        } else {
-            self.plus_any(other)
-        }
     }
 
     #[inline(never)]
@@ -214,11 +189,35 @@ impl Unbounded {
         let sum = a * power_of_two(up - most) + b * power_of_two(up_too - most);
         Unbounded { factor: sum, exponent: most }
     }
+}
 
-    /// The number in f64.
+impl Running for Unbounded {
     #[inline(always)]
-    pub fn value(self) -> f64 {
+    fn times(self, x: f64) -> Self {
+        let factor = self.factor * x;
+        if Unbounded::is_in_the_middle(factor) { Unbounded { factor, ..self } } else { self.times_any(x) }
+    }
+    #[inline(always)]
+    fn product(self, other: Self) -> Self {
+        let product = self.times(other.factor);
+        Unbounded { exponent: product.exponent + other.exponent, ..product }
+    }
+    #[inline(always)]
+    fn plus(self, other: Self) -> Self {
+        let factor = self.factor + other.factor;
+        if self.exponent == other.exponent && Unbounded::is_in_the_middle(factor) {
+            Unbounded { factor, ..self }
+        } else {
+            self.plus_any(other)
+        }
+    }
+    #[inline(always)]
+    fn value(self) -> f64 {
         if self.exponent == 0 { self.factor } else { scaled(self.factor, 1.0, self.exponent) }
+    }
+    #[inline(always)]
+    fn is_in_range(self) -> bool {
+        true
     }
 }
 

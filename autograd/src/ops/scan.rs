@@ -136,7 +136,7 @@ impl<T: Scalar> Op<T> for Cumsum {
 }
 
 /// A running product or sum of products.
-trait Running: Copy + From<f64> {
+pub(super) trait Running: Copy + From<f64> {
     /// The product with a number.
     fn times(self, x: f64) -> Self;
     /// The product.
@@ -169,29 +169,6 @@ impl Running for f64 {
     #[inline(always)]
     fn is_in_range(self) -> bool {
         (1e-300..1e300).contains(&self.abs())
-    }
-}
-
-impl Running for Unbounded {
-    #[inline(always)]
-    fn times(self, x: f64) -> Self {
-        self.times(x)
-    }
-    #[inline(always)]
-    fn product(self, other: Self) -> Self {
-        self.product(other)
-    }
-    #[inline(always)]
-    fn plus(self, other: Self) -> Self {
-        self.plus(other)
-    }
-    #[inline(always)]
-    fn value(self) -> f64 {
-        self.value()
-    }
-    #[inline(always)]
-    fn is_in_range(self) -> bool {
-        true
     }
 }
 
