@@ -170,7 +170,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         }
         match wrt.iter().position(|x| x.node.is_none()) {
             Some(index) => Err(Error::ByConstant { index, at }),
-            None => sweep(self, seed, wrt, keep, at),
+            None => sweep(self, seed, wrt, keep, false, at),
         }
     }
 }

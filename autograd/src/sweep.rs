@@ -21,17 +21,6 @@ pub(crate) enum Keep {
     GraphAndGradients,
 }
 
-/// The contributions to each of `wrt`, if any, to the gradient of `sum(root * seed)`.
-pub(crate) fn sweep<'t, T: Scalar>(
-    root: &Var<'t, T>,
-    seed: Var<'t, T>,
-    wrt: &[&Var<'t, T>],
-    keep: Keep,
-    at: &'static Location<'static>,
-) -> Result<Vec<Option<Sum<'t, T>>>, Error> {
-    sums(root, seed, wrt, keep, false, at)
-}
-
 /// As an unrecorded pass that frees the graph, but keeps the contributions to each of `leaves` apart, in the order of
 /// their arrival. Added to a sum, they give the bits of an uninterrupted pass.
 #[inline(never)]
@@ -42,11 +31,12 @@ pub(crate) fn parts<'t, T: Scalar>(
     at: &'static Location<'static>,
 ) -> Result<Vec<Vec<Given<'t, T>>>, Error> {
     let parts = |sum| if let Some(Sum::Apart(parts)) = sum { parts } else { vec![] };
-    Ok(sums(root, seed, leaves, Keep::Nothing, true, at)?.into_iter().map(parts).collect())
+    Ok(sweep(root, seed, leaves, Keep::Nothing, true, at)?.into_iter().map(parts).collect())
 }
 
+/// The contributions to each of `wrt`, if any, to the gradient of `sum(root * seed)`: each alone if they stay `apart`.
 #[inline(never)]
-fn sums<'t, T: Scalar>(
+pub(crate) fn sweep<'t, T: Scalar>(
     root: &Var<'t, T>,
     seed: Var<'t, T>,
     wrt: &[&Var<'t, T>],
@@ -247,7 +237,7 @@ fn differentiate<'t, T: Scalar>(
         let inputs: Vec<_> = (0..cx.len()).map(|i| cx.x(i).alias()).collect();
         if let Some(y) = op.reference(&inputs) {
             let wanted: Vec<_> = inputs.iter().zip(cx.needs).filter(|(_, needed)| **needed).map(|(x, _)| x).collect();
-            let mut sums = sweep(&y, cx.g.clone(), &wanted, Keep::GraphAndGradients, at)?.into_iter();
+            let mut sums = sweep(&y, cx.g.clone(), &wanted, Keep::GraphAndGradients, false, at)?.into_iter();
             let mut given = || sums.next().flatten().map(|sum| sum.dense(cx.tape));
             return Ok(Grads::new(cx.needs.iter().map(|&needed| if needed { given() } else { None })));
         }

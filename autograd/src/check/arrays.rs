@@ -32,6 +32,9 @@ fn shapes() -> Vec<Entry> {
     let pad = |value| shape::Pad { view: view(&[4, 5], |layout| layout.sliced(0, 1, 2, 1)), value };
     let triangle = |upper, diagonal| Entry::new(matrix::Triangle { upper, diagonal }).linear();
     vec![
+        Entry::new(view(&[2, 3, 4], |layout| layout.permuted(&[2, 0, 1]))).linear().sample(&[&[2, 3, 4]]),
+        Entry::new(view(&[4, 5], |layout| layout.sliced(1, 4, 2, -3))).linear().sample(&[&[4, 5]]),
+        Entry::new(shape::Scatter(view(&[4, 5], |layout| layout.sliced(1, 1, 3, 1)))).linear().sample(&[&[4, 3]]),
         Entry::new(view(&[3, 4], |layout| layout.diagonal(0, 1, 1))).linear().sample(&[&[3, 4]]),
         function!("windows", |x| x[0].windows(0, 3, 2)).linear().sample(&[&[7]]).sample(&[&[4, 2]]),
         Entry::new(shape::Scatter(view(&[3, 2, 4], |layout| layout.diagonal(0, 2, -1)))).linear().sample(&[&[2, 2]]),

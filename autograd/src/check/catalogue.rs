@@ -6,7 +6,7 @@ use crate::ops::trigonometric;
 use crate::ops::{Activation, Segments, activation, arithmetic, exponential, linear, matmul, reduce, segment, shape};
 use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, product, scan, select, softmax};
 use crate::{Cases, Elementwise, Formula, Op};
-use raygrad_tensor::{Layout, Shape, Tensor};
+use raygrad_tensor::{Shape, Tensor};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -258,10 +258,6 @@ fn losses() -> Vec<Entry> {
 fn core() -> Vec<Entry> {
     let shape = |extents: &[usize]| Shape::from_slice(extents);
     let segments = || Segments::new([0, 3, 3, 4, 7]);
-    let view = |from: &[usize], layout: fn(Layout) -> Layout| shape::View {
-        from: Shape::from_slice(from),
-        layout: layout(Layout::contiguous(from)),
-    };
     let sum = |extents: &[usize], mean| reduce::SumTo { shape: shape(extents), mean };
     let cumsum = |exclusive, reverse| segment::SegmentCumsum { segments: segments(), exclusive, reverse };
     let mut entries = vec![
@@ -280,9 +276,6 @@ fn core() -> Vec<Entry> {
         Entry::new(sum(&[3, 1], true)).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
         Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]) }).linear().sample(&[&[3, 1]]).sample(&[&[]]),
         Entry::new(shape::Reshape { shape: shape(&[3, 2]) }).linear().sample(&[&[2, 3]]).sample(&[&[6]]),
-        Entry::new(view(&[2, 3, 4], |layout| layout.permuted(&[2, 0, 1]))).linear().sample(&[&[2, 3, 4]]),
-        Entry::new(view(&[4, 5], |layout| layout.sliced(1, 4, 2, -3))).linear().sample(&[&[4, 5]]),
-        Entry::new(shape::Scatter(view(&[4, 5], |layout| layout.sliced(1, 1, 3, 1)))).linear().sample(&[&[4, 3]]),
         Entry::new(shape::Concat { axis: 1 }).linear().sample(&[&[2, 3], &[2, 1], &[2, 0]]).sample(&[&[2, 3]]),
         Entry::new(segment::SegmentSum(segments())).linear().sample(&[&[7]]).sample(&[&[7, 2]]),
         Entry::new(segment::SegmentExpand(segments())).linear().sample(&[&[4]]).sample(&[&[4, 2]]),

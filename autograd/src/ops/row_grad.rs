@@ -78,13 +78,6 @@ impl<T: Scalar> RowGrad<T> {
         let is_within = index.iter().all(|&row| (row as usize) < shape[0]);
         (fits && is_within).then(|| Arc::new(RowGrad { shape: shape.into(), index, rows }) as Arc<dyn SparseGrad<T>>)
     }
-
-    #[track_caller]
-    fn add(&self, dense: &mut [T]) {
-        assert_eq!(dense.len(), self.shape.iter().product::<usize>(), "a dense gradient of the table");
-        let width: usize = self.shape[1..].iter().product();
-        add_rows(dense, self.rows.as_slice(), &self.index, width, &mut vec![]);
-    }
 }
 
 impl<T: Scalar> SparseGrad<T> for RowGrad<T> {
@@ -93,7 +86,9 @@ impl<T: Scalar> SparseGrad<T> for RowGrad<T> {
     }
 
     fn add_to(&self, dense: &mut Tensor<T>) {
-        self.add(dense.as_mut_slice());
+        assert_eq!(dense.len(), self.shape.iter().product::<usize>(), "a dense gradient of the table");
+        let width: usize = self.shape[1..].iter().product();
+        add_rows(dense.as_mut_slice(), self.rows.as_slice(), &self.index, width, &mut vec![]);
     }
 
     fn as_rows(&self) -> Option<&dyn RowShare<T>> {
