@@ -4,16 +4,14 @@ use super::Entry;
 use crate::{Grads, Op, ShapeError, Tape, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
-/// A function of variables that may be called on any tape.
-struct Composed<F> {
+/// A function of variables that may be called on any tape. In a box, so that the operation is compiled once for each
+/// scalar type.
+struct Composed<T: Scalar> {
     name: &'static str,
-    f: F,
+    f: Box<dyn for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T> + Send + Sync>,
 }
 
-impl<T: Scalar, F> Op<T> for Composed<F>
-where
-    F: for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T> + Send + Sync + 'static,
-{
+impl<T: Scalar> Op<T> for Composed<T> {
     fn name(&self) -> &'static str {
         self.name
     }
@@ -60,6 +58,6 @@ impl Entry {
         f64: impl for<'t> Fn(&[Var<'t, f64>]) -> Var<'t, f64> + Send + Sync + 'static,
         f32: impl for<'t> Fn(&[Var<'t, f32>]) -> Var<'t, f32> + Send + Sync + 'static,
     ) -> Self {
-        Entry::of(Composed { name, f: f64 }, Composed { name, f: f32 })
+        Entry::of(Composed::<f64> { name, f: Box::new(f64) }, Composed::<f32> { name, f: Box::new(f32) })
     }
 }

@@ -160,6 +160,15 @@ pub fn check_function(
     x: &[Tensor<f64>],
     f: impl for<'t> Fn(&[Var<'t, f64>]) -> Var<'t, f64>,
 ) -> Result<Report, String> {
+    check_derivatives(check, x, &f)
+}
+
+/// [`check_function`], compiled once for all functions.
+fn check_derivatives(
+    check: &Check,
+    x: &[Tensor<f64>],
+    f: &dyn for<'t> Fn(&[Var<'t, f64>]) -> Var<'t, f64>,
+) -> Result<Report, String> {
     let mut report = Report::default();
     let tape = Tape::new();
     let leaves: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
