@@ -8,7 +8,7 @@ use crate::losses::photometric::Loss;
 use crate::losses::{DistortionConfig, LossTermConfig};
 use crate::model::camera_optimizer::{CameraOptimizerConfig, FOCAL, LENS, POSES, RefinedParam};
 use crate::model::exposure::{EXPOSURE, ExposureConfig, VIGNETTING};
-use crate::range::{check_range, check_schedule};
+use crate::range::{by_name, check_range, check_schedule};
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
@@ -69,21 +69,14 @@ pub enum Preset {
 impl FromStr for Preset {
     type Err = Error;
     fn from_str(name: &str) -> Result<Self> {
-        let all = [Preset::Classic, Preset::Small, Preset::Instant, Preset::Voxel];
-        all.into_iter()
-            .find(|preset| preset.to_string() == name)
+        by_name(name)
             .ok_or_else(|| Error::setting("preset", format!("is `{name}`; use classic, small, instant or voxel")))
     }
 }
 
 impl fmt::Display for Preset {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Preset::Classic => "classic",
-            Preset::Small => "small",
-            Preset::Instant => "instant",
-            Preset::Voxel => "voxel",
-        })
+        self.serialize(f)
     }
 }
 

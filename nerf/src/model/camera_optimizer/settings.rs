@@ -1,7 +1,6 @@
 //! Configuration of the camera optimizer.
 
-use crate::model::exposure::{EXPOSURE, VIGNETTING};
-use crate::range::{check_range, check_schedule};
+use crate::range::{by_name, check_range, check_schedule};
 use crate::{Error, Result};
 use raygrad_nn::Schedule;
 use serde::{Deserialize, Serialize};
@@ -54,7 +53,8 @@ impl CameraOptimizerConfig {
 }
 
 /// A camera parameter that can be refined.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum RefinedParam {
     /// Position and orientation, per image.
     Poses,
@@ -71,14 +71,7 @@ pub enum RefinedParam {
 impl FromStr for RefinedParam {
     type Err = Error;
     fn from_str(name: &str) -> Result<Self> {
-        let all = [
-            RefinedParam::Poses,
-            RefinedParam::Focal,
-            RefinedParam::Lens,
-            RefinedParam::Exposure,
-            RefinedParam::Vignetting,
-        ];
-        all.into_iter().find(|part| part.to_string() == name).ok_or_else(|| {
+        by_name(name).ok_or_else(|| {
             let what = format!("is `{name}`; use poses, focal, lens, exposure or vignetting");
             Error::setting("camera_optimizer", what)
         })
@@ -87,12 +80,6 @@ impl FromStr for RefinedParam {
 
 impl fmt::Display for RefinedParam {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            RefinedParam::Poses => POSES,
-            RefinedParam::Focal => FOCAL,
-            RefinedParam::Lens => LENS,
-            RefinedParam::Exposure => EXPOSURE,
-            RefinedParam::Vignetting => VIGNETTING,
-        })
+        self.serialize(f)
     }
 }
