@@ -64,22 +64,24 @@ pub const fn has_angle(formula: &str) -> bool {
 }
 
 macro_rules! operator {
-    ($trait:ident, $method:ident) => {
-        impl<T: Scalar, const MODE: u8> $trait for Lane<T, MODE> {
+    ($number:ident, $trait:ident, $method:ident) => {
+        impl<T: Scalar, const MODE: u8> $trait for $number<T, MODE> {
             type Output = Self;
             #[inline(always)]
             #[allow(clippy::suspicious_arithmetic_impl)] // flags are joined whatever the operator
             fn $method(self, other: Self) -> Self {
-                Lane { value: self.value.$method(other.value), outside: self.outside | other.outside }
+                $number { value: self.value.$method(other.value), outside: self.outside | other.outside }
             }
         }
     };
 }
 
-operator!(Add, add);
-operator!(Sub, sub);
-operator!(Mul, mul);
-operator!(Div, div);
+operator!(Lane, Add, add);
+operator!(Lane, Sub, sub);
+operator!(Lane, Mul, mul);
+operator!(Lane, Div, div);
+operator!(WideLane, Mul, mul);
+operator!(WideLane, Div, div);
 
 impl<T: Scalar, const MODE: u8> Neg for Lane<T, MODE> {
     type Output = Self;
@@ -179,16 +181,6 @@ pub struct WideLane<T: Scalar, const MODE: u8> {
 }
 
 macro_rules! wide {
-    ($trait:ident, $method:ident) => {
-        impl<T: Scalar, const MODE: u8> $trait for WideLane<T, MODE> {
-            type Output = Self;
-            #[inline(always)]
-            #[allow(clippy::suspicious_arithmetic_impl)] // flags are joined whatever the operator
-            fn $method(self, other: Self) -> Self {
-                WideLane { value: self.value.$method(other.value), outside: self.outside | other.outside }
-            }
-        }
-    };
     ($($f:ident($first:ident, $second:ident))+) => {
         $(
             #[inline(always)]
@@ -198,9 +190,6 @@ macro_rules! wide {
         )+
     };
 }
-
-wide!(Mul, mul);
-wide!(Div, div);
 
 impl<T: Scalar, const MODE: u8> Wide<Lane<T, MODE>> for WideLane<T, MODE> {
     #[inline(always)]
