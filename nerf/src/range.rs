@@ -1,6 +1,7 @@
 //! Range checks of settings.
 
 use crate::{Error, Result};
+use glam::DVec3;
 use raygrad_nn::Schedule;
 use serde::Deserialize;
 use serde::de::IntoDeserializer;
@@ -19,6 +20,14 @@ pub(crate) fn check_range<V: PartialOrd + fmt::Display>(name: &str, value: V, lo
         return Ok(());
     }
     Err(Error::setting(name, format!("is {value}; use {low} to {high}")))
+}
+
+/// Checks the corners of a box.
+pub(crate) fn check_bounds([low, high]: [DVec3; 2]) -> Result<()> {
+    if low.is_finite() && high.is_finite() && low.cmplt(high).all() {
+        return Ok(());
+    }
+    Err(Error::setting("bounds", format!("is {low} to {high}; use finite corners, the lower below the upper")))
 }
 
 /// Checks the number of a field's parameters: a failed allocation would abort the program.

@@ -18,6 +18,14 @@ pub struct Image {
     pub data: Vec<f32>,
 }
 
+/// The row-major index of a pixel, which must lie within the `noun`.
+#[inline]
+#[track_caller]
+pub(super) fn pixel_index([width, height]: [usize; 2], x: usize, y: usize, noun: &str) -> usize {
+    assert!(x < width && y < height, "pixel ({x}, {y}) is outside of the {width}x{height} {noun}");
+    y * width + x
+}
+
 impl Image {
     /// Creates an image of zeros.
     pub fn new(width: usize, height: usize, channels: usize) -> Self {
@@ -29,13 +37,7 @@ impl Image {
     /// # Panics
     /// If the pixel lies outside the image.
     pub fn pixel(&self, x: usize, y: usize) -> &[f32] {
-        assert!(
-            x < self.width && y < self.height,
-            "pixel ({x}, {y}) is outside of the {}x{} image",
-            self.width,
-            self.height
-        );
-        let start = (y * self.width + x) * self.channels;
+        let start = self.channels * pixel_index([self.width, self.height], x, y, "image");
         &self.data[start..start + self.channels]
     }
 
@@ -44,13 +46,7 @@ impl Image {
     /// # Panics
     /// If the pixel lies outside the image.
     pub fn pixel_mut(&mut self, x: usize, y: usize) -> &mut [f32] {
-        assert!(
-            x < self.width && y < self.height,
-            "pixel ({x}, {y}) is outside of the {}x{} image",
-            self.width,
-            self.height
-        );
-        let start = (y * self.width + x) * self.channels;
+        let start = self.channels * pixel_index([self.width, self.height], x, y, "image");
         &mut self.data[start..start + self.channels]
     }
 

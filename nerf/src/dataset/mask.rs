@@ -1,5 +1,6 @@
 //! Masks of used pixels.
 
+use super::image::pixel_index;
 use rand::{Rng, RngExt};
 
 /// A mask of the pixels of an image that training and evaluation use.
@@ -44,13 +45,7 @@ impl Mask {
     /// # Panics
     /// If it lies outside of the image.
     pub fn uses(&self, x: usize, y: usize) -> bool {
-        assert!(
-            x < self.width && y < self.height,
-            "pixel ({x}, {y}) is outside of the {}x{} mask",
-            self.width,
-            self.height
-        );
-        let pixel = y * self.width + x;
+        let pixel = pixel_index(self.size(), x, y, "mask");
         self.words[pixel / 64] >> (pixel % 64) & 1 == 1
     }
 

@@ -2,7 +2,7 @@
 
 use super::average::{Stored, average};
 use super::background::over;
-use super::image::Image;
+use super::image::{Image, pixel_index};
 use crate::error::{Error, Result};
 use crate::memory::{available_memory, gigabytes};
 use image::metadata::Orientation;
@@ -195,13 +195,7 @@ impl Photo {
     /// # Panics
     /// If the pixel lies outside of the image.
     pub fn pixel(&self, x: usize, y: usize) -> [f32; 4] {
-        assert!(
-            x < self.width && y < self.height,
-            "pixel ({x}, {y}) is outside of the {}x{} image",
-            self.width,
-            self.height
-        );
-        let start = (y * self.width + x) * self.channels;
+        let start = self.channels * pixel_index([self.width, self.height], x, y, "image");
         match &self.values {
             Values::Bytes(values) => rgba(&values[start..start + self.channels]),
             Values::Words(values) => rgba(&values[start..start + self.channels]),

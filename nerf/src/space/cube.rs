@@ -2,6 +2,7 @@
 
 use super::contraction::contract;
 use crate::camera::Ndc;
+use crate::range::check_bounds;
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
 use raygrad_autograd::{Scalar, Tensor, Var};
@@ -45,13 +46,7 @@ impl Space {
     /// If a corner is not finite or the lower one is not below the upper one along each axis, if `unit` is not above 0,
     /// or as [`Ndc::check`].
     pub fn check(&self) -> Result<()> {
-        let [low, high] = self.bounds;
-        if !(low.is_finite() && high.is_finite() && low.cmplt(high).all()) {
-            return Err(Error::setting(
-                "bounds",
-                format!("is {low} to {high}; use finite corners, the lower below the upper"),
-            ));
-        }
+        check_bounds(self.bounds)?;
         self.ndc.as_ref().map_or(Ok(()), Ndc::check)?;
         if self.unit > 0.0 && self.unit.is_finite() {
             return Ok(());

@@ -29,19 +29,16 @@ impl Photo {
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
         let [width, height] = [self.width as u32, self.height as u32];
+        let of_bytes = |bytes: Vec<u8>| match self.channels {
+            3 => ImageBuffer::from_raw(width, height, bytes).map(DynamicImage::ImageRgb8),
+            _ => ImageBuffer::from_raw(width, height, bytes).map(DynamicImage::ImageRgba8),
+        };
         let decoded = match (&self.values, self.channels) {
-            (Values::Bytes(v), 3) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgb8),
-            (Values::Bytes(v), _) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgba8),
+            (Values::Bytes(v), _) => of_bytes(v.clone()),
             (Values::Words(v), 3) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgb16),
             (Values::Words(v), _) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgba16),
             // Floats become bytes.
-            (Values::Floats(v), channels) => {
-                let bytes = v.iter().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-                match channels {
-                    3 => ImageBuffer::from_raw(width, height, bytes).map(DynamicImage::ImageRgb8),
-                    _ => ImageBuffer::from_raw(width, height, bytes).map(DynamicImage::ImageRgba8),
-                }
-            }
+            (Values::Floats(v), _) => of_bytes(v.iter().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8).collect()),
         };
         let decoded = decoded.ok_or_else(|| Error::file(path, "has a number of values that does not fit its size"))?;
         save(&decoded, path, About::default())

@@ -55,6 +55,7 @@ mod store;
 mod tests;
 mod update;
 
+use crate::range::check_bounds;
 use crate::{Error, Result};
 use empty_cubes::Leaps;
 use glam::DVec3;
@@ -187,13 +188,7 @@ impl OccupancyGrid {
     /// If the configuration is out of range, or the box is flat or not finite.
     pub fn new(bounds: [DVec3; 2], config: &OccupancyConfig) -> Result<Self> {
         config.check()?;
-        let [low, high] = bounds;
-        if !(low.is_finite() && high.is_finite() && low.cmplt(high).all()) {
-            return Err(Error::setting(
-                "bounds",
-                format!("is {low} to {high}; use finite corners, the lower below the upper"),
-            ));
-        }
+        check_bounds(bounds)?;
         let lattice = Lattice { bounds, resolution: config.resolution, cascades: config.cascades };
         let words = vec![u64::MAX; lattice.words()];
         let leaps = Leaps::new(&words, &lattice);
