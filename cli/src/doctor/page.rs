@@ -61,9 +61,7 @@ fn section(photographs: &HashMap<&str, &View>, finding: &Finding) -> String {
 /// An image as a small PNG; `None` if it cannot be read, which has its own finding.
 fn thumbnail(view: &View) -> Option<String> {
     let photo = Photo::open(view.image.as_ref()?, None).ok()?;
-    let share = (SIDE as f64 / photo.width.max(photo.height) as f64).min(1.0);
-    let size = [photo.width, photo.height].map(|side| ((side as f64 * share).round() as usize).max(1));
-    Some(BASE64_STANDARD.encode(photo.resized(size).over([1.0; 3]).to_png()))
+    Some(BASE64_STANDARD.encode(photo.at_most(SIDE).over([1.0; 3]).to_png()))
 }
 
 fn capitalised(text: &str) -> String {

@@ -162,7 +162,7 @@ impl PhotoCache {
             Scene::Folder(_) => self.capture.photo(&entry.view)?,
             made => self.made(made, entry)?,
         };
-        Ok(if photo.width.max(photo.height) > LONGEST { shrunk(&photo) } else { photo })
+        Ok(photo.at_most(LONGEST))
     }
 
     /// An image of a built-in scene.
@@ -210,20 +210,13 @@ fn best(points: &[Point]) -> impl Iterator<Item = &Point> {
     points.into_iter().take(MOST_POINTS)
 }
 
-/// The image, downscaled to the longest side in memory.
-fn shrunk(photo: &Photo) -> Photo {
-    let share = LONGEST as f64 / photo.width.max(photo.height) as f64;
-    let side = |side: usize| ((side as f64 * share).round() as usize).max(1);
-    photo.resized([side(photo.width), side(photo.height)])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use raygrad::Schedule;
     use raygrad::nerf::dataset::SceneTransform;
     use raygrad::nerf::glam::DAffine3;
-    use raygrad::nerf::{Config, Image, Preset, SceneBox};
+    use raygrad::nerf::{Config, Preset, SceneBox};
     use std::path::PathBuf;
 
     /// Images of these splits at these positions, looking down.
@@ -355,13 +348,5 @@ mod tests {
         photos.points = vec![(DVec3::new(1.0, 2.0, 3.0), [4, 5, 6])];
         assert_eq!(photos.points(&model(UNIT, &[], false)), [([1.0, 2.0, 3.0], [4, 5, 6])]);
         assert_eq!(SceneTransform::default().point(DVec3::X), DVec3::X);
-    }
-
-    #[test]
-    fn shrunk_large_image_keeps_its_aspect() {
-        for (size, expected) in [([3200, 100], [1600, 50]), ([20, 1700], [19, 1600]), ([1601, 1], [1600, 1])] {
-            let small = shrunk(&Photo::from(Image::new(size[0], size[1], 3)));
-            assert_eq!([small.width, small.height], expected);
-        }
     }
 }

@@ -271,6 +271,16 @@ impl Photo {
         Photo { width, height, channels: self.channels, values }
     }
 
+    /// [Downsizes](Self::resized) to a longest side of at most `longest` pixels.
+    ///
+    /// # Panics
+    /// If the image has no pixels.
+    #[track_caller]
+    pub fn at_most(&self, longest: usize) -> Photo {
+        let share = (longest as f64 / self.width.max(self.height) as f64).min(1.0);
+        self.resized([self.width, self.height].map(|side| ((side as f64 * share).round() as usize).max(1)))
+    }
+
     /// Converts a dynamic mask of instant-ngp to one of used pixels: black pixels become white, and others black.
     pub(super) fn inverted(mut self) -> Photo {
         match &mut self.values {

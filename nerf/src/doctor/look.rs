@@ -60,8 +60,7 @@ fn look_at(view: &View) -> Result<Look> {
     let photo = Photo::open(&path, size)?;
     let unread_profile = Photo::has_unread_profile(&path)?;
     let transparent = photo.has_alpha().then(|| photo.transparent_share() > 0.0);
-    let middle = shrunk(&photo, LONGEST);
-    let small = shrunk(&photo, SMALL);
+    let [middle, small] = [LONGEST, SMALL].map(|longest| photo.at_most(longest));
     let mask = view.mask_photo(None)?;
     let used = mask
         .as_ref()
@@ -74,13 +73,6 @@ fn look_at(view: &View) -> Result<Look> {
     let sharpness = sharpness(&grey(&middle, mean(&small.to_image())));
     let hash = hasher.finish();
     Ok(Look { transparent, unread_profile, hash, sharpness, luminance, balance, used, picture })
-}
-
-/// Downsizes an image to a longest side of at most `longest`.
-fn shrunk(photo: &Photo, longest: usize) -> Photo {
-    let Photo { width, height, .. } = *photo;
-    let share = (longest as f64 / width.max(height) as f64).min(1.0);
-    photo.resized([width, height].map(|side| ((side as f64 * share).round() as usize).max(1)))
 }
 
 /// See [`Look::sharpness`].

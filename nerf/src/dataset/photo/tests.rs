@@ -45,6 +45,15 @@ fn resizing_to_other_ratios_shares_pixels() {
 }
 
 #[test]
+fn downsized_image_keeps_its_aspect() {
+    let cases = [([3200, 100], [1600, 50]), ([20, 1700], [19, 1600]), ([1601, 1], [1600, 1]), ([9, 8], [9, 8])];
+    for ([width, height], expected) in cases {
+        let small = Photo::from(Image::new(width, height, 3)).at_most(1600);
+        assert_eq!([small.width, small.height], expected);
+    }
+}
+
+#[test]
 fn masks_multiply_alpha() {
     let mask = bytes(2, 1, 3, &[255, 0, 0, 51, 255, 255]);
     assert_eq!(bytes(2, 1, 3, &[1, 2, 3, 4, 5, 6]).masked(&mask), bytes(2, 1, 4, &[1, 2, 3, 255, 4, 5, 6, 51]));
