@@ -132,14 +132,16 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     }
 }
 
+/// The length of the first line of a file, and its words after [`MAGIC`].
+fn header(bytes: &[u8]) -> Option<(usize, impl Iterator<Item = &str>)> {
+    let end = bytes.iter().take(LONGEST).position(|byte| *byte == b'\n')?;
+    Some((end, std::str::from_utf8(&bytes[..end]).ok()?.strip_prefix(MAGIC)?.split_whitespace()))
+}
+
 /// Fails if the file's beginning names a later version.
 fn check_version(path: &Path, beginning: &[u8]) -> Result<()> {
-    let version = || -> Option<u32> {
-        let line = beginning.iter().take(LONGEST).position(|byte| *byte == b'\n')?;
-        let words = std::str::from_utf8(&beginning[..line]).ok()?.strip_prefix(MAGIC)?;
-        words.split_whitespace().next()?.parse().ok()
-    };
-    match version().filter(|version| *version > VERSION) {
+    let version = header(beginning).and_then(|(_, mut words)| words.next()?.parse::<u32>().ok());
+    match version.filter(|version| *version > VERSION) {
         None => Ok(()),
         Some(version) => Err(Error::file(
             path,
@@ -155,16 +157,12 @@ fn check_version(path: &Path, beginning: &[u8]) -> Result<()> {
 pub(super) fn parse(path: &Path, mut bytes: Vec<u8>) -> Result<Vec<u8>> {
     let bad = |what: String| Error::file(path, what);
     check_version(path, &bytes)?;
-    let end = bytes.iter().take(LONGEST).position(|byte| *byte == b'\n');
-    let line = end.and_then(|end| std::str::from_utf8(&bytes[..end]).ok()?.strip_prefix(MAGIC));
-    let (Some(end), Some(line)) = (end, line) else {
-        return Err(bad("not a checkpoint, or its header is damaged".into()));
-    };
-    let mut words = line.split_whitespace();
-    let version: Option<u32> = words.next().and_then(|word| word.parse().ok());
-    let sum = words.next().and_then(|word| u32::from_str_radix(word, 16).ok());
-    let length: Option<usize> = words.next().and_then(|word| word.parse().ok());
-    let (Some(_), Some(sum), Some(length)) = (version, sum, length) else {
+    let header = header(&bytes).and_then(|(end, mut words)| {
+        words.next()?.parse::<u32>().ok()?;
+        let sum = u32::from_str_radix(words.next()?, 16).ok()?;
+        Some((end, sum, words.next()?.parse::<usize>().ok()?))
+    });
+    let Some((end, sum, length)) = header else {
         return Err(bad("not a checkpoint, or its header is damaged".into()));
     };
     let state = bytes.split_off(end + 1);
