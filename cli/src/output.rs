@@ -42,6 +42,13 @@ fn is_device<T>(_: &T) -> bool {
     false
 }
 
+/// Lists at most `most` names, and counts the others: `a, b and 3 more`.
+pub fn listed(names: &[String], most: usize) -> String {
+    let (named, rest) = names.split_at(most.min(names.len()));
+    let more = if rest.is_empty() { String::new() } else { format!(" and {} more", rest.len()) };
+    named.join(", ") + &more
+}
+
 /// Writes a line to standard error, on rank 0 alone. Ignores errors, unlike `eprintln`, which panics if standard error is closed.
 pub fn note(line: &str) {
     if !ranks::is_silent() {

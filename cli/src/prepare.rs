@@ -22,7 +22,7 @@ use raygrad::nerf::Error;
 use raygrad::nerf::dataset::Capture;
 
 use super::interrupt::Work;
-use super::output::{complain, print};
+use super::output::{complain, listed, print};
 use super::parse;
 use super::scene::{Scene, assumptions};
 use super::shard::Shard;
@@ -205,9 +205,7 @@ fn report(found: &poses::Found, count: usize, out: &Path) -> Work<()> {
     let models = if *models > 1 { format!(", in the largest of {models} models") } else { String::new() };
     print(&format!("cameras  {registered} of {count} images registered{models}\n"))?;
     if !lost.is_empty() {
-        let more = lost.len().saturating_sub(NAMED);
-        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-        print(&format!("no pose  {}{more}\n", lost[..lost.len().min(NAMED)].join(", ")))?;
+        print(&format!("no pose  {}\n", listed(lost, NAMED)))?;
     }
     if 2 * registered < count {
         complain("warning: most images have no camera pose: take more images that overlap and are sharp");

@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::lock::{Lock, State, UNFINISHED};
-use super::output::{check_writable, complain, entries, remove};
+use super::output::{check_writable, complain, entries, listed, remove};
 use super::parse::read_text;
 use super::run::write_json;
 use super::scratch::ScratchFolder;
@@ -378,9 +378,7 @@ fn incomplete(at: &Path, all: &BTreeMap<usize, Record>, count: usize) -> Option<
         })
     });
     let missing: Vec<String> = missing.collect();
-    let more = missing.len().saturating_sub(NAMED);
-    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-    (!missing.is_empty()).then(|| format!("{}{more}", missing[..missing.len().min(NAMED)].join(", ")))
+    (!missing.is_empty()).then(|| listed(&missing, NAMED))
 }
 
 impl Complete {

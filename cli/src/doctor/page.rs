@@ -10,6 +10,7 @@ use raygrad::nerf::{Error, Result};
 use super::stage::Stage;
 use super::table;
 use crate::html::{escaped, filled, in_script};
+use crate::output::listed;
 
 /// The template of the page.
 const PAGE: &str = include_str!("page.html");
@@ -46,7 +47,7 @@ fn section(photographs: &HashMap<&str, &View>, finding: &Finding) -> String {
         escaped(advice)
     );
     if !views.is_empty() {
-        text += &format!("<p class=\"names\">{}</p>\n", escaped(&table::names(finding, NAMES)));
+        text += &format!("<p class=\"names\">{}</p>\n", escaped(&listed(views, NAMES)));
     }
     let images = views.iter().filter_map(|name| Some((name, thumbnail(photographs.get(name.as_str())?)?)));
     let figures = images.take(SHOWN).map(|(name, png)| {

@@ -2,6 +2,8 @@
 
 use raygrad::nerf::doctor::{CaptureSubset, Facts, Finding, Range, Report, Resolution, SceneLayout};
 
+use crate::output::listed;
+
 /// Most image names per finding. The page shows more.
 const NAMES: usize = 6;
 /// Columns of a line of advice.
@@ -46,15 +48,6 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     rows
 }
 
-/// The image names of a finding, up to `most`.
-pub fn names(finding: &Finding, most: usize) -> String {
-    let mut text = joined(finding.views.iter().take(most).cloned());
-    if finding.views.len() > most {
-        text += &format!(" and {} more", finding.views.len() - most);
-    }
-    text
-}
-
 /// The report for a terminal.
 pub fn text(report: &Report) -> String {
     let rows = facts(&report.facts);
@@ -65,10 +58,10 @@ pub fn text(report: &Report) -> String {
         text += "\nno problems found\n";
     }
     for finding in &report.findings {
-        let Finding { kind, severity, what, advice, .. } = finding;
+        let Finding { kind, severity, what, advice, views } = finding;
         text += &format!("\n{severity}: {kind}: {what}\n");
-        if !finding.views.is_empty() {
-            text += &format!("  {}\n", names(finding, NAMES));
+        if !views.is_empty() {
+            text += &format!("  {}\n", listed(views, NAMES));
         }
         text += &wrapped(advice);
     }
