@@ -19,9 +19,13 @@ pub(super) fn by_id(id: i32) -> Result<&'static Model, (Option<usize>, String)> 
     })
 }
 
-/// The model with a name, or an error message.
+/// The model with a name in any case, or an error message.
 pub(super) fn by_name(name: &str) -> Result<&'static Model, String> {
-    Model::named(name).ok_or_else(|| unsupported(&start(name)))
+    let name = name.to_ascii_uppercase();
+    let is_other = OTHERS.iter().any(|other| other.1 == name);
+    let what = "is no known camera model: write the name of one, such as PINHOLE, or undistort the images with \
+                `colmap image_undistorter`";
+    Model::named(&name).ok_or_else(|| if is_other { unsupported(&name) } else { format!("`{}` {what}", start(&name)) })
 }
 
 /// The names of a model's parameters, in the order of the files.
@@ -132,7 +136,9 @@ mod tests {
             let [by_id, by_name] = [by_id(id).ok(), by_name(name).ok()].map(Option::unwrap);
             assert_eq!((by_id.name, params(by_id).count(), by_name.id), (name, count, id));
         }
-        assert!(by_name("OPENCV2").is_err());
+        assert_eq!(by_name("opencv").unwrap(), by_name("OPENCV").unwrap());
+        assert!(by_name("eucm").unwrap_err().starts_with("EUCM is not supported"));
+        assert!(by_name("OPENCV2").unwrap_err().starts_with("`OPENCV2` is no known camera model"));
         assert_eq!(
             [11, 12, 13, 16, 18, -1].map(|id| by_id(id).unwrap_err().0),
             [Some(16), Some(4), Some(5), Some(6), None, None]

@@ -218,7 +218,7 @@ fn text_errors_name_the_line() {
         (0, " -0.125", "", "`line 4`", "k1: is missing"),
         (0, "-0.125", "0 0", "`line 4`", "PARAMS: SIMPLE_RADIAL takes 4: remove the others"),
         (0, "SIMPLE_RADIAL", "EUCM", "`line 4`", "EUCM is not supported"),
-        (0, "SIMPLE_RADIAL", "radial", "`line 4`", "MODEL: radial is not supported"),
+        (0, "SIMPLE_RADIAL", "radial_4", "`line 4`", "MODEL: `RADIAL_4` is no known camera model"),
         (0, "9 SIMPLE", "7 SIMPLE", "`line 4`", "camera_id: is `7`, as that of line 2 is"),
         (0, "100 80", "0 80", "`line 4`", "width: must be 1 to"),
         (0, "100 80", "100 99999999999", "`line 4`", "height: must be 1 to"),
@@ -231,7 +231,6 @@ fn text_errors_name_the_line() {
         (1, "1 1 0", "3 1 0", "`line 5`", "image_id: is `3`, as that of line 3 is"),
         (1, "a.png", "b/second.png", "`line 5`", "name: is `b/second.png`, as that of line 3 is"),
         (1, " a.png", "", "`line 5`", "name: is empty"),
-        (1, "10.5 11.5 1 12.5 13.5 -1 \n", "", "`line 4`", "POINTS2D: must be triples"),
         (1, "13.5 -1 \n", "13.5\n", "`line 4`", "POINTS2D: must be triples"),
     ];
     for (which, from, to, field, expected) in cases {
@@ -359,6 +358,24 @@ fn hand_written_text_files_are_read() {
     );
 }
 
+#[test]
+fn text_images_without_empty_lines_are_read() {
+    let [cameras, _, points] = text();
+    let images = |text: &str| {
+        let files = [cameras.clone(), text.as_bytes().to_vec(), points.clone()];
+        let capture = read(folder(Encoding::Text, "sparse/0", &files).path())?;
+        Ok::<_, Error>(capture.views.into_iter().map(|view| view.name).collect::<Vec<_>>())
+    };
+    let observed = "1 1 0 0 0 0 0 4 7 a.png\n10.5 11.5 1 12.5 13.5 -1\n";
+    let names = images(&format!("{observed}2 1 0 0 0 0 0 4 7 b c.JPG\n3 1 0 0 0 0 0 4 7 d.png\n\n")).unwrap();
+    assert_eq!(names, ["a.png", "b c.JPG", "d.png"]);
+    // Neither observations nor an image.
+    for line in ["2 1 0 0 0 0 0 4 7 b", "2 1 0 0 0 x 0 4 7 b.png", "1 0 0 0 0 0 4 7 b.png x"] {
+        let message = images(&format!("1 1 0 0 0 0 0 4 7 a.png\n{line}\n")).unwrap_err().to_string();
+        assert!(message.contains("`line 2`: POINTS2D: must be triples"), "{message}");
+    }
+}
+
 /// The cameras and images of eight views, each with its camera; the lines of one can be replaced.
 fn eight(change: impl Fn(usize) -> Option<[String; 2]>) -> [Vec<u8>; 3] {
     let own = |i: usize| [format!("{i} PINHOLE 8 6 9 9 4 3"), format!("{i} 1 0 0 0 0 0 4 {i} {i}.png\n")];
@@ -378,6 +395,10 @@ fn single_invalid_cameras_are_left_out() {
         ("3 EQUIRECTANGULAR 8 6 8 7", "", "must be those of the image, 8 and 6, are 8 and 7"),
         ("", "3 0 0 0 0 0 0 4 3 3.png\n", "qvec: is a quaternion of length 0"),
         ("", "3 1 0 0 0 inf 0 4 3 3.png\n", "tvec: must be a finite number, is inf"),
+        ("", "3 -nan(ind) 0 0 0 0 0 4 3 3.png\n", "qvec: must be a finite number, is NaN"),
+        ("", "3 1 0 0 0 0 1.#QNAN 4 3 3.png\n", "tvec: must be a finite number, is NaN"),
+        ("3 PINHOLE 8 6 -1.#IND 9 4 3", "", "fx: must be a finite number, is NaN"),
+        ("3 pinhole2 8 6 9 9 4 3", "", "`PINHOLE2` is no known camera model"),
     ] {
         let bad = |i: usize| {
             let lines = |own: String, other: &str| if other.is_empty() { own } else { other.to_owned() };

@@ -2,6 +2,7 @@
 
 use super::super::encodings::decoded;
 use super::super::limits::start;
+use super::super::paths::extension;
 use super::super::points::{Points, reason};
 use super::entries::{CameraEntry, ImageEntry, Place};
 use super::models;
@@ -44,7 +45,8 @@ impl<'a> Words<'a> {
     /// Reads a number, which may be infinite or NaN.
     fn f64(&mut self, member: &str) -> Result<f64> {
         let word = self.word(member)?;
-        word.parse().map_err(|_| self.error(member, format!("must be a finite number, is `{}`", start(word))))
+        let bad = || self.error(member, format!("must be a finite number, is `{}`", start(word)));
+        word.parse().ok().or_else(|| nan(word)).ok_or_else(bad)
     }
 
     fn f64s<const N: usize>(&mut self, member: &str) -> Result<[f64; N]> {
@@ -61,6 +63,12 @@ impl<'a> Words<'a> {
             value => Err(self.error(member, format!("must be a finite number, is {value}"))),
         }
     }
+}
+
+/// NaN, for a word that Windows writes for a number that is not finite, such as `-nan(ind)` and `1.#QNAN`.
+fn nan(word: &str) -> Option<f64> {
+    let word = word.trim_start_matches(['-', '+']);
+    (word.starts_with("nan(") || word.starts_with("1.#")).then_some(f64::NAN)
 }
 
 /// The lines of a file, numbered from 1.
@@ -94,7 +102,7 @@ pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
 
 pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
     let text = decoded(bytes);
-    let mut lines = lines(file, &text);
+    let mut lines = lines(file, &text).peekable();
     let mut images = vec![];
     while let Some(mut line) = lines.next() {
         if !speaks(&line) {
@@ -105,16 +113,22 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
         let camera = line.integer("CAMERA_ID")?;
         // The name is the rest of the line, since it may contain spaces.
         images.push(ImageEntry::new(file, line.place, id, q, t, camera, line.rest.trim())?);
-        // The next line holds the image's observations, also if it is empty.
-        if let Some(line) = lines.next() {
+        // The next line holds the image's observations, also if it is empty. Some programs leave empty lines out.
+        if let Some(line) = lines.next_if(|line| !is_image(line.rest)) {
             observations(&line)?;
         }
     }
     Ok(images)
 }
 
-/// Checks that a line holds observations. If an empty line is missing, the next image stands there; it must not be lost
-/// silently.
+/// Returns true for the line of an image. It is no line of observations, as it ends in the name of an image file.
+fn is_image(line: &str) -> bool {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let is_number = |word: &&str| word.parse::<f64>().is_ok() || nan(word).is_some();
+    words.len() >= 10 && words[..9].iter().all(is_number) && extension(line).is_some()
+}
+
+/// Checks that a line holds observations, so that no image is lost silently.
 fn observations(line: &Words<'_>) -> Result<()> {
     let (mut count, mut last) = (0, "-1");
     for word in line.rest.split_whitespace() {
