@@ -47,14 +47,13 @@ pub(super) fn models(folder: &Path) -> Vec<PathBuf> {
         numbers.sort_unstable();
         folders.extend(numbers.into_iter().map(|number| place.join(number.to_string())));
     }
-    let file = |folder: PathBuf| {
-        let files = Encoding::ALL.into_iter().map(|encoding| encoding.files(&folder));
-        files
-            .into_iter()
-            .find(|[cameras, images, _]| cameras.is_file() && images.is_file())
-            .map(|[_, images, _]| images)
-    };
-    folders.into_iter().filter_map(file).collect()
+    folders.iter().flat_map(|folder| models_in(folder)).collect()
+}
+
+/// The files of images of the models in their own folder: one of each encoding that it holds.
+pub(super) fn models_in(folder: &Path) -> Vec<PathBuf> {
+    let files = Encoding::ALL.into_iter().map(|encoding| encoding.files(folder));
+    files.filter(|[cameras, images, _]| cameras.is_file() && images.is_file()).map(|[_, images, _]| images).collect()
 }
 
 /// The file of images of the model that a file is part of.

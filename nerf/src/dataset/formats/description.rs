@@ -63,10 +63,13 @@ impl Description {
         }
     }
 
-    /// The path below the capture's folder, of a COLMAP model without its file.
+    /// The path below the capture's folder, of a COLMAP model without its file unless that has a twin in the other
+    /// encoding.
     fn name(&self) -> String {
         let inside = self.file.strip_prefix(&self.folder).unwrap_or(&self.file);
-        let inside = if self.format == Format::Colmap { inside.parent().unwrap_or(inside) } else { inside };
+        let is_alone = ["bin", "txt"].iter().any(|ending| !self.file.with_extension(ending).is_file());
+        let is_model = self.format == Format::Colmap && is_alone;
+        let inside = if is_model { inside.parent().unwrap_or(inside) } else { inside };
         let name = inside.display().to_string();
         if name.is_empty() { self.format.to_string() } else { name }
     }

@@ -86,6 +86,37 @@ fn most_complete_description_counts() {
 }
 
 #[test]
+fn both_encodings_of_a_model_count() {
+    let [folder, other] = [0, 1].map(|_| tempfile::tempdir().unwrap());
+    let path = folder.path();
+    write(path, Format::Colmap, [5, 5], 0);
+    // The text of an earlier model, and a newer one.
+    for (total, expected) in [(3, "sparse/0/images.bin"), (5, "sparse/0/images.bin"), (7, "sparse/0/images.txt")] {
+        write(other.path(), Format::Colmap, [7, total], total);
+        let capture = read(&other.path().join(format!("sparse/{total}")), None).unwrap();
+        let text = tempfile::tempdir().unwrap();
+        colmap::write(&capture, text.path(), Encoding::Text).unwrap();
+        for name in ["cameras.txt", "images.txt"] {
+            std::fs::copy(text.path().join("sparse/0").join(name), path.join("sparse/0").join(name)).unwrap();
+        }
+        (0..total).for_each(|i| kit::picture(&path.join(format!("images/{i}.png")), 8, 6));
+        let capture = read(path, None).unwrap();
+        assert_eq!(capture.file, path.join(expected));
+        let note = match total {
+            3 => "images found: `sparse/0/images.bin` 5 of 5, `sparse/0/images.txt` 3 of 3; used the first",
+            5 => "",
+            _ => "images found: `sparse/0/images.txt` 7 of 7, `sparse/0/images.bin` 5 of 5; used the first",
+        };
+        assert_eq!(capture.assumptions.concat(), note);
+    }
+    // An empty file is damaged, and the error names the other.
+    std::fs::write(path.join("sparse/0/images.bin"), "").unwrap();
+    let message = read(path, None).unwrap_err().to_string();
+    let advice = "to use `sparse/0/images.txt` instead, name ";
+    assert!(message.contains("sparse/0/images.bin") && message.contains(advice), "{message}");
+}
+
+#[test]
 fn files_name_their_description() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();
