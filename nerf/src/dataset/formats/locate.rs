@@ -106,6 +106,18 @@ pub(super) fn locate(
     Ok(found)
 }
 
+/// The folders in `root` with these names in any case, in the order of the names; exact names come first.
+pub(super) fn folders(root: &Path, names: &[&str]) -> Vec<PathBuf> {
+    let rated = |entry: std::fs::DirEntry| {
+        let name = entry.file_name();
+        let place = names.iter().position(|own| name.eq_ignore_ascii_case(own))?;
+        entry.path().is_dir().then(|| (place, name != names[place], entry.path()))
+    };
+    let mut found: Vec<_> = std::fs::read_dir(root).into_iter().flatten().flatten().filter_map(rated).collect();
+    found.sort();
+    found.into_iter().map(|(.., path)| path).collect()
+}
+
 /// A path's folder and file name.
 fn split(path: &str) -> [&str; 2] {
     let (place, name) = path.rsplit_once('/').unwrap_or(("", path));

@@ -1,18 +1,17 @@
 //! Masks in a folder beside the images, and dynamic masks among them.
 
-use super::locate::stem;
+use super::locate::{folders, stem};
 use super::paths::{extension, folded};
 use crate::dataset::capture::{Capture, View};
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-/// Names of mask folders.
+/// Names of mask folders, in any case.
 const FOLDERS: [&str; 2] = ["masks", "mask"];
 
 /// Sets the masks of views that have one in a mask folder of `roots`. An assumption says if only some have one.
 pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) {
-    let folders = roots.iter().flat_map(|root| FOLDERS.map(|name| root.join(name)));
-    let folders: Vec<PathBuf> = folders.filter(|folder| folder.is_dir()).collect();
+    let folders: Vec<PathBuf> = roots.iter().flat_map(|root| folders(root, &FOLDERS)).collect();
     let Some(name) = folders.first().and_then(|folder| folder.file_name()).map(Path::new) else { return };
     let mut listings = HashMap::new();
     for view in &mut capture.views {
@@ -131,6 +130,27 @@ mod tests {
             picture(&mask, 8, 6);
             attach(&mut capture, &[folder.path().to_owned()]);
             assert_eq!((capture.views[0].mask.as_ref(), capture.assumptions.len()), (Some(&mask), 0), "{name}");
+        }
+    }
+
+    #[test]
+    fn mask_folders_are_found_in_any_case() {
+        let found = |places: &[&str]| {
+            let folder = tempfile::tempdir().unwrap();
+            let mut capture = picture_with_camera(folder.path());
+            places.iter().for_each(|place| picture(&folder.path().join(place).join("0.png"), 8, 6));
+            attach(&mut capture, &[folder.path().to_owned()]);
+            let mask = capture.views.remove(0).mask?;
+            Some(mask.parent()?.file_name()?.to_str()?.to_owned())
+        };
+        for (places, expected) in [
+            (&["Masks"][..], Some("Masks")),
+            (&["MASK"], Some("MASK")),
+            (&["Masks", "masks"], Some("masks")),
+            (&["mask", "Masks"], Some("Masks")),
+            (&["masks_old"], None),
+        ] {
+            assert_eq!(found(places).as_deref(), expected, "{places:?}");
         }
     }
 
