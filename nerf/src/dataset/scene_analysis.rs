@@ -1,6 +1,7 @@
 //! Analysis of a capture's cameras: scene transform (up, centre, scale), type of scene, scene box, near and far plane.
 
 use super::capture::{Capture, Format, Point, View};
+use super::formats::DEEPEST;
 use super::frames::evenly_spaced;
 use super::scene_transform::SceneTransform;
 use super::scene_type::SceneType;
@@ -73,7 +74,8 @@ impl SceneAnalysis {
                 return Err(Error::file(&capture.file, "lists no images; add frames to it"));
             };
             let what = format!(
-                "none of the {} images exists (the first is `{}`) in or below {}; correct the paths or copy the images there",
+                "none of the {} images exists (the first is `{}`) in {} or up to {DEEPEST} folders below it; correct the \
+                 paths or copy the images there",
                 capture.views.len(),
                 first.name,
                 capture.folder.display()

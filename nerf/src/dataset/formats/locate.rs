@@ -6,18 +6,18 @@
 
 use super::paths::{self, composed, extension, folded};
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::ffi::OsString;
 use std::path::{Component, Path, PathBuf};
 
 /// The deepest folder that is searched, and the most entries.
-const DEEPEST: usize = 5;
+pub(in crate::dataset) const DEEPEST: usize = 8;
 const MOST_ENTRIES: usize = 200_000;
 
 /// Names of folders with the images of a split. Those of one split never take the place of another's.
 const SPLITS: [&str; 4] = ["train", "val", "eval", "test"];
 /// Words in the names of folders with other files than images.
-const LAYERS: [&str; 4] = ["mask", "depth", "normal", "segment"];
+const LAYERS: [&str; 7] = ["mask", "depth", "normal", "segment", "confidence", "alpha", "label"];
 /// The last parts of a listed path that state its kind; those before are the user's.
 const STATED: usize = 2;
 
@@ -48,7 +48,26 @@ pub(super) fn locate(
     let exact = |name: &&str| paths::find(folder, name).map(|path| Located { path, factor: 1 });
     let mut found: Vec<Option<Located>> = names.iter().map(exact).collect();
     let listed: Vec<[&str; 2]> = names.iter().map(|name| split(name)).collect();
-    let existing: HashSet<&str> = (0..names.len()).filter(|&i| found[i].is_some()).map(|i| listed[i][0]).collect();
+    let existing: BTreeSet<&str> = (0..names.len()).filter(|&i| found[i].is_some()).map(|i| listed[i][0]).collect();
+    let mut tree = None;
+    // A folder with few of its files may be a stale copy.
+    for place in &existing {
+        let all: Vec<usize> = (0..names.len()).filter(|&i| listed[i][0] == *place).collect();
+        if all.iter().filter(|&&i| found[i].is_some()).count() * 2 >= all.len() {
+            continue;
+        }
+        let file = |i: usize| found[i].as_ref().and_then(|file| file.path.file_name()?.to_str());
+        let files: Vec<&str> = all.iter().map(|&i| file(i).unwrap_or(listed[i][1])).collect();
+        let others = tree.get_or_insert_with(|| Tree::new(folder)).others(place);
+        let others = others.filter(|inside| !existing.iter().any(|place| *inside == Path::new(place)));
+        let others = others.map(|inside| folder.join(inside));
+        let Some((other, note)) = fuller(folder, &folder.join(place), others, &files) else { continue };
+        let files = files.iter().map(|file| other.join(file)).collect::<Vec<_>>();
+        for (i, path) in all.into_iter().zip(files) {
+            found[i] = path.is_file().then_some(Located { path, factor: 1 });
+        }
+        assumptions.push(note);
+    }
     let mut groups: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
     for i in (0..names.len()).filter(|&i| found[i].is_none()) {
         groups.entry(listed[i][0]).or_default().push(i);
@@ -57,7 +76,6 @@ pub(super) fn locate(
     let exact: HashSet<PathBuf> = found.iter().flatten().map(|file| file.path.clone()).collect();
     let is_free = |path: &PathBuf| !exact.contains(path) && !taken.contains(path);
     let mut owners: HashMap<PathBuf, usize> = HashMap::new();
-    let mut tree = None;
     for (place, group) in groups {
         // Images with another extension, in a folder of which others exist as listed, are others.
         let is_there = existing.contains(place);
@@ -106,6 +124,9 @@ pub(super) fn locate(
     Ok(found)
 }
 
+/// Names of image folders.
+pub(super) const IMAGES: [&str; 4] = ["images", "image", "rgb", "input"];
+
 /// The folders in `root` with these names in any case, in the order of the names; exact names come first.
 pub(super) fn folders(root: &Path, names: &[&str]) -> Vec<PathBuf> {
     let rated = |entry: std::fs::DirEntry| {
@@ -116,6 +137,38 @@ pub(super) fn folders(root: &Path, names: &[&str]) -> Vec<PathBuf> {
     let mut found: Vec<_> = std::fs::read_dir(root).into_iter().flatten().flatten().filter_map(rated).collect();
     found.sort();
     found.into_iter().map(|(.., path)| path).collect()
+}
+
+/// The fullest of `others` and a note, if `folder` is a stale copy of it: with less than half of the files of these
+/// names, each as long as in the other. Files of other lengths may be other images, such as undistorted ones.
+pub(super) fn fuller(
+    root: &Path,
+    folder: &Path,
+    others: impl Iterator<Item = PathBuf>,
+    names: &[&str],
+) -> Option<(PathBuf, String)> {
+    let length = |path: PathBuf| path.metadata().ok().filter(|about| about.is_file()).map(|about| about.len());
+    let lengths = |folder: &Path| names.iter().map(|name| length(folder.join(name))).collect::<Vec<_>>();
+    let own = lengths(folder);
+    let held = own.iter().flatten().count();
+    if 2 * held >= names.len() {
+        return None;
+    }
+    let rated = others.filter_map(|other| {
+        let lengths = lengths(&other);
+        let count = lengths.iter().flatten().count();
+        let is_copied = own.iter().zip(&lengths).all(|(own, other)| own.is_none() || own == other);
+        (is_copied && count > held).then_some((count, other))
+    });
+    let (count, other) = rated.reduce(|best, next| if next.0 > best.0 { next } else { best })?;
+    let [from, to] = [folder, &other].map(|path| shown(path.strip_prefix(root).unwrap_or(path)));
+    let total = names.len();
+    Some((other, format!("`{from}` holds {held} of {total} files: used `{to}`, which holds {count}")))
+}
+
+/// A path below a folder, which is `.` itself.
+fn shown(inside: &Path) -> String {
+    if inside.as_os_str().is_empty() { ".".to_owned() } else { inside.display().to_string() }
 }
 
 /// A path's folder and file name.
@@ -219,19 +272,12 @@ impl Tree {
                 *counts.entry(*holder).or_default() += 1;
             }
         }
-        let wanted: Vec<String> =
-            place.split('/').filter(|part| !matches!(*part, "" | "." | "..")).map(lower).collect();
-        let splits =
-            |parts: &[String]| SPLITS.map(|split| parts.iter().any(|part| words(part).any(|word| word == split)));
-        let layers = |parts: &[String]| LAYERS.map(|layer| parts.iter().any(|part| part.contains(layer)));
-        let stated = layers(&wanted[wanted.len().saturating_sub(STATED)..]);
+        let wanted = wanted(place);
         let rate = |directory: &Directory, count: usize| {
             let own = parts(&directory.inside);
-            let is_of_split = splits(&own).iter().zip(splits(&wanted)).all(|(own, wanted)| *own <= wanted);
-            let is_of_kind = is_of_split && layers(&own) == stated;
             let path = self.root.iter().chain(&own);
             let common = path.rev().zip(wanted.iter().rev()).take_while(|(a, b)| a == b).count();
-            (is_of_kind && (common > 0 || 2 * count > names.len()))
+            (is_of_kind(&own, &wanted) && (common > 0 || 2 * count > names.len()))
                 .then_some((common, Reverse(factor_of(&directory.inside))))
         };
         let rated: Vec<_> = counts
@@ -241,6 +287,26 @@ impl Tree {
         let most = rated.iter().map(|(rating, _)| *rating).max();
         rated.into_iter().filter(|(rating, _)| Some(*rating) == most).map(|(_, directory)| directory).collect()
     }
+
+    /// The paths of the folders of full size whose kind is that of the listed folder `place`.
+    fn others(&self, place: &str) -> impl Iterator<Item = &Path> {
+        let wanted = wanted(place);
+        let folders = self.directories.iter().map(|directory| directory.inside.as_path());
+        folders.filter(move |inside| factor_of(inside) == 1 && is_of_kind(&parts(inside), &wanted))
+    }
+}
+
+/// The folded parts of a listed folder.
+fn wanted(place: &str) -> Vec<String> {
+    place.split('/').filter(|part| !matches!(*part, "" | "." | "..")).map(lower).collect()
+}
+
+/// Returns true if the files of a folder may be those of a listed one: of the same splits and layers.
+fn is_of_kind(own: &[String], wanted: &[String]) -> bool {
+    let splits = |parts: &[String]| SPLITS.map(|split| parts.iter().any(|part| words(part).any(|word| word == split)));
+    let layers = |parts: &[String]| LAYERS.map(|layer| parts.iter().any(|part| part.contains(layer)));
+    let stated = layers(&wanted[wanted.len().saturating_sub(STATED)..]);
+    splits(own).iter().zip(splits(wanted)).all(|(own, wanted)| *own <= wanted) && layers(own) == stated
 }
 
 /// All folders below `folder`, itself included, in the order of their paths.

@@ -1,14 +1,11 @@
 //! The images and masks of a model.
 
-use super::super::locate::locate;
+use super::super::locate::{IMAGES, fuller, locate};
 use crate::dataset::capture::Capture;
 use crate::dataset::formats::masks;
 use crate::error::{Error, Result};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
-
-/// Names of image folders.
-const IMAGES: [&str; 4] = ["images", "image", "rgb", "input"];
 
 /// Sets the existing image and mask of each view. `model` is the folder of the model.
 ///
@@ -25,9 +22,16 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
         images.reverse();
     }
     images.extend([root.clone(), capture.folder.clone()]);
-    let has_any = |folder: &&PathBuf| capture.views.iter().any(|view| folder.join(&view.name).is_file());
+    let names: Vec<&str> = capture.views.iter().map(|view| view.name.as_str()).collect();
+    let has_any = |folder: &&PathBuf| names.iter().any(|name| folder.join(name).is_file());
     let (folder, below) = match images.iter().find(has_any) {
-        Some(folder) => (folder.clone(), ""),
+        Some(folder) => match fuller(&root, folder, images.iter().cloned(), &names) {
+            Some((other, note)) => {
+                capture.assumptions.push(note);
+                (other, "")
+            }
+            None => (folder.clone(), ""),
+        },
         // Names of a model are relative to its folder of images.
         None => (root.clone(), "images/"),
     };

@@ -478,6 +478,34 @@ fn images_are_found_in_other_folders_and_spellings() {
 }
 
 #[test]
+fn stale_copies_of_images_are_not_used() {
+    let folder = folder(Encoding::Text, "sparse/0", &eight(|_| None));
+    let write = |place: &str, i: usize, content: &str| {
+        let place = folder.path().join(place);
+        fs::create_dir_all(&place).unwrap();
+        fs::write(place.join(format!("{i}.png")), content).unwrap();
+    };
+    let found = || {
+        let capture = read(folder.path()).unwrap();
+        let inside = |place: &str| {
+            let images = capture.views.iter().filter_map(|view| view.image.as_ref());
+            images.filter(|image| image.starts_with(folder.path().join(place))).count()
+        };
+        (["images", "input"].map(inside), capture.assumptions.clone())
+    };
+    (0..8).for_each(|i| write("input", i, "original"));
+    (0..3).for_each(|i| write("images", i, "original"));
+    let note = "`images` holds 3 of 8 files: used `input`, which holds 8";
+    assert_eq!(found(), ([0, 8], vec![note.to_owned()]));
+    // Others, such as undistorted images.
+    write("images", 1, "other");
+    assert_eq!(found(), ([3, 0], vec![]));
+    // Half of the images.
+    (0..4).for_each(|i| write("images", i, "original"));
+    assert_eq!(found(), ([4, 0], vec![]));
+}
+
+#[test]
 fn distorted_models_have_the_images_of_input() {
     let folder = folder(Encoding::Text, "distorted/sparse/0", &text());
     for name in ["images/a.png", "input/a.png", "images/b/second.png", "input/b/second.png"] {

@@ -65,6 +65,12 @@ fn folders_are_found_by_the_end_of_the_path() {
 }
 
 #[test]
+fn folders_are_searched_to_a_depth() {
+    finds(&["1/2/3/4/5/6/7/8/0.png"], &["images/0.png"], &["1/2/3/4/5/6/7/8/0.png"]);
+    finds(&["1/2/3/4/5/6/7/8/9/0.png"], &["images/0.png"], &[""]);
+}
+
+#[test]
 fn letter_case_and_extension_may_differ() {
     finds(&["Images/IMG_1.JPG"], &["images/img_1.jpg"], &["Images/IMG_1.JPG"]);
     finds(&["images/a.png", "images/b.png"], &["images/a.jpg", "images/b.jpg"], &["images/a.png", "images/b.png"]);
@@ -132,6 +138,8 @@ fn files_of_another_kind_take_no_place() {
     absent(&["test/r_0.png"], &["train/r_0.png"]);
     absent(&["val/r_0.png", "test/r_0.png"], &["train/r_0.png"]);
     absent(&["masks/0.png", "depth/0.png", "normals/0.png", "segmentation/0.png"], &["images/0.jpg"]);
+    absent(&["confidence/0.png", "alpha/0.png", "label/0.png", "Labels/0.png"], &["images/0.jpg"]);
+    finds(&["confidence/0.png", "rgb/0.png"], &["images/0.png"], &["rgb/0.png"]);
     absent(&["images/0.png"], &["masks/0.png"]);
     absent(&["train_hr/r_0.png"], &["test/r_0.png"]);
     let (_parent, folder) = scene(&["pictures/0.png"]);
@@ -145,6 +153,31 @@ fn files_of_another_kind_take_no_place() {
     finds(&["images/0.png", "x/1.png"], &["images/0.png", "y/0.png"], &["images/0.png", ""]);
     finds(&["masks/0.png", "images/0.png"], &["C:/x/masks/0.png"], &["masks/0.png"]);
     finds(&["set/train/0.png", "set/test/0.png"], &["C:/x/train/0.png"], &["set/train/0.png"]);
+}
+
+#[test]
+fn stale_copies_give_way_to_their_originals() {
+    // Names of files, which are as long as their number.
+    let at = |files: &[(&str, usize)], names: &[&str]| {
+        let (_parent, folder) = scene(&files.iter().map(|(file, _)| *file).collect::<Vec<_>>());
+        files.iter().for_each(|(file, length)| std::fs::write(folder.join(file), vec![0; *length]).unwrap());
+        let mut assumptions = vec![];
+        let located = locate(&folder, names, &HashSet::new(), &mut assumptions).unwrap();
+        let found: Vec<PathBuf> = located.into_iter().flatten().map(|file| file.path).collect();
+        (found.iter().filter(|path| path.starts_with(folder.join("photos"))).count(), found.len(), assumptions)
+    };
+    let names = ["images/1.png", "images/2.png", "images/3.png"];
+    let all = [("photos/1.png", 1), ("photos/2.png", 2), ("photos/3.png", 3)];
+    let with = |others: &[(&'static str, usize)]| [&all, others].concat();
+    let note = "`images` holds 1 of 3 files: used `photos`, which holds 3";
+    assert_eq!(at(&with(&[("images/2.png", 2)]), &names), (3, 3, vec![note.to_owned()]));
+    // Another image of the same name, most images, and images that other entries list.
+    assert_eq!(at(&with(&[("images/2.png", 9)]), &names), (0, 1, vec![]));
+    assert_eq!(at(&with(&[("images/2.png", 2), ("images/3.png", 3)]), &names), (0, 2, vec![]));
+    let two = [&names[..], &["photos/1.png"]].concat();
+    assert_eq!(at(&with(&[("images/2.png", 2)]), &two), (1, 2, vec![]));
+    let masks = [("masks/1.png", 1), ("masks/2.png", 2), ("images/1.png", 1)];
+    assert_eq!(at(&masks, &names), (0, 1, vec![]));
 }
 
 #[test]
