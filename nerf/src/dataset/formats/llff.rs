@@ -1,12 +1,13 @@
 //! `poses_bounds.npy` of LLFF (Mildenhall et al. 2019): a row of 17 numbers for each image.
 //!
 //! The first 15 are a 3x5 matrix: the camera's directions down, right and backwards, its position, and height, width
-//! and focal length in pixels. The last two are the nearest and farthest depth. Rows belong to the images of the folder
-//! `images` in the order of their names, or to those of them that `view_imgs.txt` lists.
+//! and focal length in pixels. The last two are the nearest and farthest depth. Rows belong to the images of a
+//! folder, usually `images`, in the order of their names, or to those of them that `view_imgs.txt` lists.
 
 use super::limits::{MOST_PIXELS, start};
-use super::locate::stem;
+use super::locate::{IMAGES, folders, stem};
 use super::npy::Matrix;
+use super::paths::extension;
 use super::{masks, rigid};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -21,22 +22,36 @@ const FILE: &str = "poses_bounds.npy";
 /// The names of the images with a pose, by LLFF's `imgs2poses` of many tools.
 const LIST: &str = "view_imgs.txt";
 const COLUMNS: usize = 17;
+/// The extensions that readers of the format know.
 const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
+/// The most by which the farthest depth may exceed the nearest. Other depths are no measurement.
+const MOST_RATIO: f64 = 1e4;
+/// The condition on depths, for messages.
+const DEPTHS: &str = "must be above 0 and rise, by a factor of 10000 at most";
 
 /// The file of a capture's folder.
 pub(super) fn file(folder: &Path) -> PathBuf {
     folder.join(FILE)
 }
 
-/// Reads the cameras of `folder`. No image is decoded. Invalid depths are ignored, as [`Capture::assumptions`] says.
+/// Reads the cameras of `folder`. No image is decoded. Invalid depths are ignored, and single images without a valid
+/// camera left out, as [`Capture::assumptions`] says.
 ///
 /// # Errors
-/// If a file is absent or damaged, a number is not valid for a camera, or the numbers of images and cameras differ
-/// without a `view_imgs.txt`. The error names the file and the row, counted from 0.
+/// If a file is absent or damaged, half of the rows or more are not valid for a camera, or the numbers of images and
+/// cameras differ without a `view_imgs.txt`. The error names the file and the row, counted from 0.
 pub fn read(folder: &Path) -> Result<Capture> {
     let file = file(folder);
     let bytes = std::fs::read(&file).map_err(|e| Error::file(&file, format!("cannot be read: {e}")))?;
-    let mut capture = parse(folder, &bytes, images(folder)?)?;
+    let images = images(folder)?;
+    let place = images.first().and_then(|(_, path)| path.parent()).unwrap_or(folder).to_owned();
+    let mut capture = parse(folder, &bytes, images)?;
+    let name = place.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    if place == folder || !name.starts_with("images") {
+        let place = place.strip_prefix(folder).unwrap_or(&place).display().to_string();
+        let place = if place.is_empty() { format!("beside `{FILE}`") } else { format!("of `{place}`") };
+        capture.assumptions.push(format!("there are no images in `images`: used those {place}"));
+    }
     masks::attach(&mut capture, &[folder.to_owned()]);
     Ok(capture)
 }
@@ -59,24 +74,39 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
         images = listed(folder, matrix.rows, images)?;
         assumptions.push(format!("took the {} images that `{LIST}` lists, of {count}", matrix.rows));
     }
-    let (mut views, mut invalid) = (Vec::with_capacity(matrix.rows), vec![]);
+    let (mut views, mut invalid, mut left_out) = (Vec::with_capacity(matrix.rows), vec![], vec![]);
     for (index, (row, (name, image))) in matrix.values.chunks_exact(COLUMNS).zip(images).enumerate() {
         let field = format!("row {index}");
         let bad = |what| Error::field(&file, &field, what);
         let row = row.try_into().map_err(|_| bad("must have 17 numbers".into()))?;
-        let (camera, bounds) = camera(row).map_err(bad)?;
+        let (camera, bounds) = match camera(row) {
+            Ok(valid) => valid,
+            Err(what) => {
+                left_out.push((name, bad(what)));
+                continue;
+            }
+        };
         if bounds.is_none() {
             invalid.push(format!("row {index} has {} and {}", row[15], row[16]));
         }
         views.push(View { image, bounds, ..View::new(name, field, camera) });
     }
     if let Some(first) = invalid.first() {
-        let what = "must be at least 0 and rise";
         assumptions.push(format!(
-            "ignored the depths of {} of {} rows, which {what}: {first}",
+            "ignored the depths of {} of {} rows, which {DEPTHS}: {first}",
             invalid.len(),
             views.len()
         ));
+    }
+    let count = left_out.len();
+    if let Some((name, error)) = left_out.into_iter().next() {
+        // Images that are mostly left out make a bad scene.
+        if views.len() <= count {
+            return Err(error);
+        }
+        let total = matrix.rows;
+        assumptions
+            .push(format!("left out {count} of {total} images without a valid camera, such as `{name}`: {error}"));
     }
     Ok(Capture { assumptions, ..Capture::new(folder, file, Format::Llff, views) })
 }
@@ -154,24 +184,24 @@ fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, Option<[f64; 2]>
     if focal <= 0.0 {
         return Err(format!("focal length must be more than 0, is {focal}"));
     }
-    let bounds = Some([row[15], row[16]]).filter(|[near, far]| *near >= 0.0 && far > near && far.is_finite());
+    let bounds = Some([row[15], row[16]]).filter(|[near, far]| *near > 0.0 && far > near && *far <= MOST_RATIO * near);
     let centre = [0.5 * width as f64, 0.5 * height as f64];
     Ok((Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose }, bounds))
 }
 
-/// The names and paths of images, sorted by name. They come from the folder `images` or, if that has none, from the
-/// least reduced `images_N`.
+/// The names and paths of images, sorted by name. They come from the folder `images` in any case or, if that has none,
+/// from the least reduced `images_N`, another usual image folder, or the capture's folder itself.
 fn images(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
     let mut reduced: Vec<(u32, String)> = vec![];
     for name in names(folder)? {
         reduced.extend(name.strip_prefix("images_").and_then(|n| n.parse().ok()).map(|n: u32| (n, name.clone())));
     }
     reduced.sort();
-    for name in std::iter::once("images".to_owned()).chain(reduced.into_iter().map(|(_, name)| name)) {
-        let folder = folder.join(name);
-        if !folder.is_dir() {
-            continue;
-        }
+    let mut places = folders(folder, &IMAGES[..1]);
+    places.extend(reduced.into_iter().map(|(_, name)| folder.join(name)).filter(|place| place.is_dir()));
+    places.extend(folders(folder, &IMAGES[1..]));
+    places.push(folder.to_owned());
+    for folder in places {
         let mut found = names(&folder)?;
         found.retain(|name| is_image(name) && folder.join(name).is_file());
         found.sort();
@@ -179,17 +209,13 @@ fn images(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
             return Ok(found.into_iter().map(|name| (name.clone(), folder.join(name))).collect());
         }
     }
-    let what = "has no images (png, jpg): put them in this folder, or in images_4 or images_8";
+    let what = "has no images (png, jpg, webp): put them in this folder, or in images_4 or images_8";
     Err(Error::file(folder.join("images"), what))
 }
 
 /// Returns true for the name of an image. Hidden files, such as the `._` twins of macOS, are none.
 fn is_image(name: &str) -> bool {
-    if name.starts_with('.') {
-        return false;
-    }
-    let extension = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
-    EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
+    !name.starts_with('.') && extension(name).is_some()
 }
 
 /// The names of the files in a folder.
@@ -219,7 +245,8 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
     let mut values = Vec::with_capacity(COLUMNS * views.len());
     for (index, view) in views.iter().enumerate() {
         let bad = |member: &str, what| Error::field(&capture.file, format!("{}.{member}", view.field), what);
-        if !is_image(&view.name) || view.name.contains(['/', '\\']) {
+        let ending = extension(&view.name).map(str::to_lowercase).unwrap_or_default();
+        if !is_image(&view.name) || !EXTENSIONS.contains(&&*ending) || view.name.contains(['/', '\\']) {
             let what =
                 format!("`{}` must be a plain png or jpg name without folders, as LLFF has one folder", view.name);
             return Err(bad("name", what));
@@ -241,7 +268,7 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
         [row[15], row[16]] = [near, far];
         // The reader's checks: a written row must be readable.
         if camera(&row).map_err(|what| bad("camera", what))?.1.is_none() {
-            return Err(bad("bounds", format!("must be at least 0 and rise, are {near} and {far}")));
+            return Err(bad("bounds", format!("{DEPTHS}, are {near} and {far}")));
         }
         values.extend(row);
     }

@@ -67,7 +67,7 @@ fn reduced_images_replace_absent_ones() {
     assert_eq!(read(all.path()).unwrap().views[0].name, "2.png", "an empty folder has none");
     let none = folder(&npy(&ROWS), &[]);
     let message = read(none.path()).unwrap_err().to_string();
-    assert!(message.contains("images") && message.contains("has no images (png, jpg)"), "{message}");
+    assert!(message.contains("images") && message.contains("has no images (png, jpg, webp)"), "{message}");
 }
 
 #[test]
@@ -99,15 +99,71 @@ fn llff_errors_name_the_row() {
 
 #[test]
 fn invalid_depths_are_ignored() {
-    for (column, value, expected) in [(15, -1.0, "-1 and 9"), (16, 2.5, "2.5 and 2.5"), (16, f64::NAN, "2.5 and NaN")] {
+    for (column, value, expected) in [
+        (15, -1.0, "-1 and 9"),
+        (15, 0.0, "0 and 9"),
+        (15, 8e-4, "0.0008 and 9"),
+        (16, 2.5, "2.5 and 2.5"),
+        (16, f64::NAN, "2.5 and NaN"),
+    ] {
         let mut rows = ROWS;
         rows[1][column] = value;
         let capture = read(folder(&npy(&rows), &IMAGES).path()).unwrap();
         assert_eq!(capture.views.iter().map(|view| view.bounds).collect::<Vec<_>>(), [Some([1.5, 20.0]), None]);
-        let what = "ignored the depths of 1 of 2 rows, which must be at least 0 and rise: row 1 has";
+        let what = format!("ignored the depths of 1 of 2 rows, which {DEPTHS}: row 1 has");
         assert_eq!(capture.assumptions, [format!("{what} {expected}")]);
     }
-    assert_eq!(read(folder(&npy(&ROWS), &IMAGES).path()).unwrap().assumptions, [""; 0]);
+    let mut rows = ROWS;
+    rows[1][15] = 1e-3;
+    for rows in [ROWS, rows] {
+        assert_eq!(read(folder(&npy(&rows), &IMAGES).path()).unwrap().assumptions, [""; 0]);
+    }
+}
+
+#[test]
+fn single_invalid_rows_are_left_out() {
+    let images = ["images/0.png", "images/1.png", "images/2.png"];
+    for (bad, expected) in
+        [([0.0; COLUMNS], "must be a rotation, but"), ([f64::NAN; COLUMNS], "column 0 is not a finite number")]
+    {
+        let capture = read(folder(&npy(&[ROWS[0], bad, ROWS[1]]), &images).path()).unwrap();
+        let names: Vec<&str> = capture.views.iter().map(|view| view.name.as_str()).collect();
+        assert_eq!((names, capture.views[1].bounds), (vec!["0.png", "2.png"], Some([2.5, 9.0])));
+        let [what] = &capture.assumptions[..] else { panic!("{:?}", capture.assumptions) };
+        assert!(what.starts_with("left out 1 of 3 images without a valid camera, such as `1.png`: "), "{what}");
+        assert!(what.contains("`row 1`: ") && what.contains(expected), "{what}");
+        let message = read(folder(&npy(&[ROWS[0], bad, bad]), &images).path()).unwrap_err().to_string();
+        assert!(message.contains("`row 1`: ") && message.contains(expected), "{message}");
+    }
+}
+
+#[test]
+fn images_of_other_folders_and_types_are_found() {
+    let found = |images: &[&str]| {
+        let folder = folder(&npy(&ROWS), images);
+        let capture = read(folder.path())?;
+        let path = |view: View| view.image.unwrap().strip_prefix(folder.path()).unwrap().display().to_string();
+        Ok::<_, Error>((path(capture.views.into_iter().next().unwrap()), capture.assumptions))
+    };
+    let note = |place: &str| vec![format!("there are no images in `images`: used those {place}")];
+    for (images, expected) in [
+        (&["images/0.webp", "images/1.WEBP"][..], vec![]),
+        (&["Images/0.png", "Images/1.png", "rgb/9.png"], vec![]),
+        (&["images_4/0.png", "images_4/1.png", "input/9.png"], vec![]),
+        (&["input/0.png", "input/1.png", "9.png"], note("of `input`")),
+        (&["RGB/0.jpg", "RGB/1.jpg"], note("of `RGB`")),
+        (&["0.jpg", "1.jpg", "masks/0.png"], note("beside `poses_bounds.npy`")),
+    ] {
+        let mut notes = expected;
+        notes.extend(images.contains(&"masks/0.png").then(|| "masks".to_owned()));
+        let (first, said) = found(images).unwrap();
+        assert_eq!((first.as_str(), said.len()), (images[0], notes.len()));
+        assert!(said.iter().zip(&notes).all(|(said, note)| said.contains(note)), "{said:?}");
+    }
+    let message = found(&["photos/0.png", "photos/1.png"]).unwrap_err().to_string();
+    assert!(message.contains("has no images (png, jpg, webp)"), "{message}");
+    let message = found(&["input/0.png", "input/1.png", "input/2.png"]).unwrap_err().to_string();
+    assert!(message.contains("has 2 rows, but there are 3 images in "), "{message}");
 }
 
 #[test]
@@ -206,12 +262,13 @@ fn unwritable_llff_captures_are_named() {
         &|capture| capture.views[1].bounds = None,
         "`row 1.bounds`: are missing; LLFF needs the nearest and the farthest depth",
     );
-    let invalid = "`row 1.bounds`: must be at least 0 and rise, are 2 and 1";
-    fails(&|capture| capture.views[1].bounds = Some([2.0, 1.0]), invalid);
+    let invalid = format!("`row 1.bounds`: {DEPTHS}, are 2 and 1");
+    fails(&|capture| capture.views[1].bounds = Some([2.0, 1.0]), &invalid);
     fails(
         &|capture| capture.views[1].name = "a/b.png".into(),
         "`row 1.name`: `a/b.png` must be a plain png or jpg name",
     );
+    fails(&|capture| capture.views[1].name = "b.webp".into(), "`row 1.name`: `b.webp` must be a plain png or jpg name");
     fails(&|capture| capture.views[1].name = "b".into(), "`row 1.name`: `b` must be a plain png or jpg name");
     fails(&|capture| capture.views[1].name = "a.png".into(), "`row 1.name`: `a.png` is there twice");
     fails(&|capture| capture.views.clear(), "has no images to write: add at least one");
@@ -226,7 +283,7 @@ proptest! {
         match parse(Path::new("x"), &damaged(&npy(&ROWS), &npy(&ROWS[..1]), &damage), images) {
             Ok(capture) => for View { camera, bounds, .. } in &capture.views {
                 prop_assert!(rigid::pose(&camera.pose).is_ok() && camera.focal[0] > 0.0, "{:?}", camera);
-                prop_assert!(bounds.is_none_or(|[near, far]| 0.0 <= near && near < far && far.is_finite()));
+                prop_assert!(bounds.is_none_or(|[near, far]| 0.0 < near && near < far && far.is_finite()));
             },
             Err(error) => clear(error, FILE),
         }
