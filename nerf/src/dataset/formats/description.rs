@@ -7,12 +7,24 @@ use crate::error::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Files of other programs that are no capture yet: a file or folder, the program, and the remedy.
-const EXPORTS: [(&str, &str, &str); 6] = [
+const EXPORTS: [(&str, &str, &str); 18] = [
     ("keyframes", "a raw export of Polycam", "convert it with nerfstudio's `ns-process-data polycam`"),
     ("rgbd", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
     ("EXR_RGBD", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
     ("intrinsics.txt", "a dataset of NSVF", "write its poses as transforms_train.json"),
     ("cameras_sphere.npz", "a dataset of DTU", "write its matrices as transforms.json"),
+    ("cameras.npz", "a dataset of IDR or VolSDF", "write its matrices as transforms.json"),
+    ("meta_data.json", "a dataset of SDFStudio", "write its frames as transforms.json"),
+    ("intrinsic/intrinsic_color.txt", "a scene of ScanNet", "write its poses as transforms.json"),
+    ("cams/00000000_cam.txt", "a dataset of MVSNet", "write its cameras as transforms.json"),
+    ("odometry.csv", "a scan of Stray Scanner", "write its poses as transforms.json"),
+    ("cameras.xml", "an export of Agisoft Metashape", "convert it with nerfstudio's `ns-process-data metashape`"),
+    ("odm_report", "a project of OpenDroneMap", "convert it with nerfstudio's `ns-process-data odm`"),
+    ("reconstruction.json", "a reconstruction of OpenSfM", "convert it with `opensfm export_colmap`"),
+    ("sfm_data.json", "a scene of OpenMVG", "convert it with `openMVG_main_openMVG2Colmap`"),
+    ("sfm_data.bin", "a scene of OpenMVG", "convert it with `openMVG_main_openMVG2Colmap`"),
+    ("cameras.sfm", "a scene of Meshroom", "convert it with `aliceVision_exportColmap`"),
+    ("bundle.out", "a reconstruction of Bundler", "write its cameras as transforms.json"),
     ("database.db", "a COLMAP project without a model", "run COLMAP's mapper, or `raygrad prepare` on the images"),
 ];
 

@@ -190,7 +190,10 @@ fn damaged_descriptions_before_the_best_are_errors() {
 fn exports_of_other_programs_are_named() {
     for (name, what, remedy) in EXPORTS {
         let folder = tempfile::tempdir().unwrap();
-        std::fs::write(folder.path().join(name), b"").unwrap();
+        let file = folder.path().join(name);
+        std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+        std::fs::write(file, b"").unwrap();
+        assert!(is_described(folder.path()), "{name}");
         let message = read(folder.path(), None).unwrap_err().to_string();
         assert!(message.contains(what) && message.contains(remedy), "{message}");
     }
