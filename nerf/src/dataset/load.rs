@@ -138,8 +138,8 @@ impl Capture {
         Ok(self)
     }
 
-    /// Returns true if a folder or its parent describes a capture, or if the folder is an export of another program that
-    /// first needs its own conversion. Other folders of images need poses.
+    /// Returns true if a folder or its parent describes a capture, if the folder holds one below, or if it is an export of
+    /// another program that first needs its own conversion. Other folders of images need poses.
     pub fn is_described(folder: impl AsRef<Path>) -> bool {
         formats::is_described(folder.as_ref())
     }

@@ -25,7 +25,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use table::Table;
 
-pub(super) use beside::root;
+pub(super) use beside::{root, root_below};
 pub use encoding::Encoding;
 
 /// Folders of models within a capture, in the order of the search. In those of `true`, each model has a folder with its

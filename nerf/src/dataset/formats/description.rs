@@ -1,5 +1,6 @@
 //! Which files of a folder describe a capture.
 
+use super::locate::{shown, walk};
 use super::{blender, colmap, llff, transforms};
 use crate::dataset::capture::{Capture, Format};
 use crate::dataset::frames::Split;
@@ -27,6 +28,9 @@ const EXPORTS: [(&str, &str, &str); 18] = [
     ("bundle.out", "a reconstruction of Bundler", "write its cameras as transforms.json"),
     ("database.db", "a COLMAP project without a model", "run COLMAP's mapper, or `raygrad prepare` on the images"),
 ];
+
+/// The deepest folder that is searched for a description in an unusual place.
+const DEEPEST: usize = 3;
 
 /// The files that describe a capture.
 #[derive(Debug, Clone, PartialEq)]
@@ -58,6 +62,7 @@ impl Description {
         let format = match (name, ending) {
             _ if Split::ALL.iter().any(|split| name == blender::name_of(*split)) => Format::Blender,
             (_, "json") => Format::Transforms,
+            _ if is_transforms(name) => Format::Transforms,
             ("poses_bounds.npy", _) => Format::Llff,
             _ => return Some(Description::of_model(folder, colmap::images_beside(&folder.join(name))?)),
         };
@@ -115,13 +120,66 @@ fn descriptions(folder: &Path) -> Vec<Description> {
     out
 }
 
+/// Returns true for a name like transforms.json: in any case, with more words, or with `.txt`, as Windows may add.
+fn is_transforms(name: &str) -> bool {
+    let lower = name.to_lowercase();
+    let is_split = Split::ALL.iter().any(|split| name == blender::name_of(*split));
+    let lower = lower.strip_suffix(".txt").unwrap_or(&lower);
+    lower == "transform.json" || lower.starts_with("transforms") && lower.ends_with(".json") && !is_split
+}
+
+/// The descriptions in unusual places in or below a folder without [usual ones](descriptions).
+fn elsewhere(folder: &Path) -> Vec<Description> {
+    let mut out = vec![];
+    for directory in walk(folder, DEEPEST) {
+        let place = folder.join(&directory.inside);
+        let names = directory.names().into_iter().filter(|name| name.to_str().is_some_and(is_transforms));
+        out.extend(names.map(|name| Description::new(Format::Transforms, &place, place.join(name))));
+        out.extend(blender::file(&place).map(|file| Description::new(Format::Blender, &place, file)));
+        let model = |file| Description::new(Format::Colmap, &colmap::root_below(folder, &place), file);
+        out.extend(colmap::models_in(&place).into_iter().map(model));
+        let file = llff::file(&place);
+        if file.is_file() {
+            out.push(Description::new(Format::Llff, &place, file));
+        }
+    }
+    out
+}
+
+/// Fails if descriptions are those of several captures: of several folders, or several files like transforms.json.
+fn check_single(folder: &Path, all: &[Description]) -> Result<()> {
+    const NAMED: usize = 4;
+    let mut captures: Vec<&Description> = vec![];
+    for one in all {
+        let is_twin = |other: &&Description| one.format == Format::Transforms && other.format == one.format;
+        if captures.iter().all(|other| other.folder != one.folder || is_twin(other)) {
+            captures.push(one);
+        }
+    }
+    if captures.len() < 2 {
+        return Ok(());
+    }
+    let named: Vec<String> = captures.iter().take(NAMED).map(|one| format!("`{}`", below(folder, &one.file))).collect();
+    let others = captures.len().saturating_sub(NAMED);
+    let others = if others > 0 { format!(" and {others} others") } else { String::new() };
+    let what = format!("holds several captures, {}{others}: name one of them", named.join(", "));
+    Err(Error::file(folder, what))
+}
+
+/// A path below a folder, for messages.
+fn below(folder: &Path, file: &Path) -> String {
+    shown(file.strip_prefix(folder).unwrap_or(file))
+}
+
 /// Reads the capture in a folder, or that of a file that describes one. `asked` limits the formats. Splits must be
 /// right only if they are `needed`.
 ///
-/// Of several descriptions, the one with most existing images counts; of equally many, the first.
+/// Of several descriptions, the one with most existing images counts; of equally many, the first. Unusual places count
+/// if the usual ones hold no description.
 ///
 /// # Errors
-/// If there is no description, a description before the best cannot be read, or as the format's own `read`.
+/// If there is no description, unusual places hold several captures, a description before the best cannot be read, or as
+/// the format's own `read`.
 pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool) -> Result<Capture> {
     if !path.exists() {
         return Err(Error::file(path, "there is no such folder"));
@@ -139,10 +197,28 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
         return description.read(needed);
     }
     let mut all = descriptions(path);
+    let is_usual = !all.is_empty();
+    if !is_usual {
+        all = elsewhere(path);
+    }
     all.retain(|description| asked.is_none_or(|format| description.format == format));
-    let Some(first) = all.first() else { return Err(unknown(path, asked)) };
-    if all.len() == 1 {
-        return first.read(needed);
+    if all.is_empty() {
+        return Err(unknown(path, asked));
+    }
+    if is_usual {
+        return most_complete(&all, needed);
+    }
+    check_single(path, &all)?;
+    let mut capture = most_complete(&all, needed)?;
+    let what = format!("the usual places hold no capture: used `{}`", below(path, &capture.file));
+    capture.assumptions.insert(0, what);
+    Ok(capture)
+}
+
+/// Reads the capture of the description with most existing images.
+fn most_complete(all: &[Description], needed: bool) -> Result<Capture> {
+    if let [one] = all {
+        return one.read(needed);
     }
     let mut captures: Vec<(&Description, Result<Capture>)> = all.iter().map(|one| (one, one.read(needed))).collect();
     let present = |capture: &Result<Capture>| capture.as_ref().map_or(0, |capture| capture.present().count());
@@ -175,16 +251,21 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
     Ok(capture)
 }
 
-/// Returns true if a folder or its parent has a description, or if the folder is an export of another program.
+/// Returns true if a folder or its parent has a description, or if the folder is an export of another program or holds
+/// captures in unusual places.
 pub(in crate::dataset) fn is_described(folder: &Path) -> bool {
     let is_near = std::iter::once(folder).chain(folder.parent()).any(|near| !descriptions(near).is_empty());
-    is_near || EXPORTS.iter().any(|(name, ..)| folder.join(name).exists())
+    is_near || EXPORTS.iter().any(|(name, ..)| folder.join(name).exists()) || !elsewhere(folder).is_empty()
 }
 
 /// The error of a folder without a description.
 fn unknown(folder: &Path, asked: Option<Format>) -> Error {
     if let Some(format) = asked {
-        let found: Vec<String> = descriptions(folder).iter().map(|one| format!("`{}`", one.name())).collect();
+        let mut found: Vec<String> = descriptions(folder).iter().map(Description::name).collect();
+        if found.is_empty() {
+            found = elsewhere(folder).iter().map(|one| below(folder, &one.file)).collect();
+        }
+        let found: Vec<String> = found.into_iter().map(|name| format!("`{name}`")).collect();
         let found = if found.is_empty() { "no capture".to_owned() } else { found.join(", ") };
         return Error::file(folder, format!("holds no capture in the format {format}, but {found}"));
     }

@@ -167,7 +167,7 @@ pub(super) fn fuller(
 }
 
 /// A path below a folder, which is `.` itself.
-fn shown(inside: &Path) -> String {
+pub(super) fn shown(inside: &Path) -> String {
     if inside.as_os_str().is_empty() { ".".to_owned() } else { inside.display().to_string() }
 }
 
@@ -194,9 +194,9 @@ pub(super) fn stem(name: &str) -> String {
 
 /// The files of a folder.
 #[derive(Clone)]
-struct Directory {
+pub(super) struct Directory {
     /// The path below the capture's folder.
-    inside: PathBuf,
+    pub(super) inside: PathBuf,
     /// The names of the files with a stem.
     files: HashMap<String, Vec<OsString>>,
 }
@@ -217,6 +217,13 @@ impl Directory {
         names.retain(|name| folder.join(inside).join(name).is_file());
         names.sort();
         Directory::new(inside.to_owned(), names)
+    }
+
+    /// The names of the files, sorted.
+    pub(super) fn names(&self) -> Vec<&OsString> {
+        let mut names: Vec<&OsString> = self.files.values().flatten().collect();
+        names.sort();
+        names
     }
 
     /// The files that fit a name best: of the same name, or else in another Unicode normal form, or else in other
@@ -253,7 +260,7 @@ struct Tree {
 impl Tree {
     fn new(folder: &Path) -> Self {
         let root = parts(&std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned()));
-        let directories = walk(folder);
+        let directories = walk(folder, DEEPEST);
         let mut holders: HashMap<String, Vec<usize>> = HashMap::new();
         for (i, directory) in directories.iter().enumerate() {
             directory.files.keys().for_each(|stem| holders.entry(stem.clone()).or_default().push(i));
@@ -309,8 +316,8 @@ fn is_of_kind(own: &[String], wanted: &[String]) -> bool {
     splits(own).iter().zip(splits(wanted)).all(|(own, wanted)| *own <= wanted) && layers(own) == stated
 }
 
-/// All folders below `folder`, itself included, in the order of their paths.
-fn walk(folder: &Path) -> Vec<Directory> {
+/// All folders at most `deepest` below `folder`, itself included, in the order of their paths, without hidden ones.
+pub(super) fn walk(folder: &Path, deepest: usize) -> Vec<Directory> {
     let (mut out, mut seen, mut entries) = (vec![], HashSet::new(), 0);
     let mut waiting = VecDeque::from([(PathBuf::new(), 0)]);
     while let Some((inside, depth)) = waiting.pop_front() {
@@ -332,8 +339,8 @@ fn walk(folder: &Path) -> Vec<Directory> {
             }
             match here.join(&name) {
                 path if path.is_file() => names.push(name),
-                path if path.is_symlink() && depth < DEEPEST => waiting.push_back((inside.join(name), depth + 1)),
-                path if path.is_dir() && depth < DEEPEST => waiting.push_front((inside.join(name), depth + 1)),
+                path if path.is_symlink() && depth < deepest => waiting.push_back((inside.join(name), depth + 1)),
+                path if path.is_dir() && depth < deepest => waiting.push_front((inside.join(name), depth + 1)),
                 _ => {}
             }
         }

@@ -51,7 +51,22 @@ pub(crate) fn root(model: &Path) -> PathBuf {
     let whole = std::path::absolute(model).unwrap_or_else(|_| model.to_owned());
     let sparse = whole.ancestors().take(2).find(|folder| folder.ends_with("sparse"));
     let Some(parent) = sparse.and_then(Path::parent) else { return model.to_owned() };
-    let has_images = IMAGES.iter().any(|name| parent.join(name).is_dir());
-    let is_inner = ["colmap", "distorted"].iter().any(|name| parent.ends_with(name)) && !has_images;
+    let is_inner = ["colmap", "distorted"].iter().any(|name| parent.ends_with(name)) && !has_images(parent);
     parent.parent().filter(|_| is_inner).unwrap_or(parent).to_owned()
+}
+
+/// The folder of the capture of a model somewhere below `folder`: its [`root`], or without one the nearest folder
+/// around it with images.
+pub(crate) fn root_below(folder: &Path, model: &Path) -> PathBuf {
+    let root = root(model);
+    let mut around = model.ancestors().take_while(|place| place.starts_with(folder));
+    if root == model {
+        return around.find(|place| has_images(place)).unwrap_or(folder).to_owned();
+    }
+    let own = around.find(|place| std::path::absolute(place).is_ok_and(|place| place == root));
+    own.map_or(root.clone(), Path::to_owned)
+}
+
+fn has_images(folder: &Path) -> bool {
+    IMAGES.iter().any(|name| folder.join(name).is_dir())
 }

@@ -166,6 +166,90 @@ fn files_name_their_description() {
     assert_eq!(read(&path.join("poses_bounds.npy"), None).unwrap().format, Format::Llff);
 }
 
+/// A folder in which the files of a capture's description are somewhere else.
+fn moved(format: Format, files: &[(&str, &str)]) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), format, [3, 3], 0);
+    for (from, to) in files {
+        let to = folder.path().join(to);
+        std::fs::create_dir_all(to.parent().unwrap()).unwrap();
+        std::fs::rename(folder.path().join(from), to).unwrap();
+    }
+    _ = std::fs::remove_dir_all(folder.path().join("sparse/0"));
+    folder
+}
+
+#[test]
+fn captures_are_found_in_unusual_places() {
+    let check = |folder: &tempfile::TempDir, file: &str, root: &str| {
+        let path = folder.path();
+        let capture = read(path, None).unwrap();
+        assert_eq!((capture.present().count(), &capture.folder), (3, &path.join(root)), "{file}");
+        assert_eq!(capture.assumptions, [format!("the usual places hold no capture: used `{file}`")]);
+        assert!(is_described(path));
+        // As a run keeps it.
+        assert_eq!(read_file(&capture.folder, &path.join(file), true).unwrap().present().count(), 3);
+    };
+    for place in ["colmap_sparse/0", "colmap_text", "colmap/sparse", "colmap", "sparse/model", "Sparse/0", "a/b/c"] {
+        let files = ["cameras.bin", "images.bin"].map(|name| [format!("sparse/0/{name}"), format!("{place}/{name}")]);
+        let folder = moved(Format::Colmap, &files.each_ref().map(|[from, to]| (from.as_str(), to.as_str())));
+        check(&folder, &format!("{place}/images.bin"), "");
+        assert!(matches!(read(folder.path(), Some(Format::Llff)), Err(error) if error.to_string().contains(place)));
+    }
+    // With images of their own.
+    for place in ["dense", "dense/0", "undistorted", "scene"] {
+        let files =
+            ["cameras.bin", "images.bin"].map(|name| [format!("sparse/0/{name}"), format!("{place}/sparse/{name}")]);
+        let folder = moved(Format::Colmap, &files.each_ref().map(|[from, to]| (from.as_str(), to.as_str())));
+        let path = folder.path();
+        assert_eq!(read(path, None).unwrap().present().count(), 0, "images of other cameras");
+        std::fs::rename(path.join("images"), path.join(place).join("images")).unwrap();
+        check(&folder, &format!("{place}/sparse/images.bin"), place);
+    }
+    for name in ["Transforms.json", "transform.json", "transforms.json.txt"] {
+        check(&moved(Format::Transforms, &[("transforms.json", name)]), name, "");
+    }
+    for (format, file) in [
+        (Format::Transforms, "transforms.json"),
+        (Format::Blender, "transforms_train.json"),
+        (Format::Llff, "poses_bounds.npy"),
+    ] {
+        let inside = format!("scene/{file}");
+        check(&moved(format, &[(file, &inside), ("images", "scene/images")]), &inside, "scene");
+    }
+    // Usual places come first.
+    let folder = moved(Format::Transforms, &[("transforms.json", "old/transforms.json"), ("images", "old/images")]);
+    write(folder.path(), Format::Llff, [1, 1], 0);
+    assert_eq!(read(folder.path(), None).unwrap().format, Format::Llff);
+}
+
+#[test]
+fn several_captures_in_unusual_places_are_named() {
+    let folder = moved(Format::Transforms, &[("transforms.json", "b/transforms.json"), ("images", "b/images")]);
+    let path = folder.path();
+    std::fs::create_dir(path.join("a")).unwrap();
+    write(&path.join("a"), Format::Llff, [1, 1], 0);
+    let message = read(path, None).unwrap_err().to_string();
+    let expected = "holds several captures, `a/poses_bounds.npy`, `b/transforms.json`: name one of them";
+    assert!(message.ends_with(expected), "{message}");
+    assert_eq!(read(path, Some(Format::Llff)).unwrap().folder, path.join("a"));
+    assert!(is_described(path));
+    // Two descriptions of one capture, and two files like transforms.json.
+    std::fs::remove_dir_all(path.join("a")).unwrap();
+    write(&path.join("b"), Format::Colmap, [3, 4], 0);
+    assert_eq!(read(path, None).unwrap().file, path.join("b/transforms.json"));
+    std::fs::copy(path.join("b/transforms.json"), path.join("b/transforms_2.json")).unwrap();
+    assert!(read(path, None).unwrap_err().to_string().contains("`b/transforms.json`, `b/transforms_2.json`: name"));
+    // Hidden folders, deeper ones and other files.
+    let places =
+        [".cache/transforms.json", "a/b/c/d/transforms.json", "dataparser_transforms.json", "transform_2.json"];
+    for place in places {
+        let folder = moved(Format::Transforms, &[("transforms.json", place)]);
+        assert!(read(folder.path(), None).unwrap_err().to_string().contains("is not a dataset"), "{place}");
+        assert!(!is_described(folder.path()), "{place}");
+    }
+}
+
 #[test]
 fn damaged_descriptions_before_the_best_are_errors() {
     let folder = tempfile::tempdir().unwrap();
