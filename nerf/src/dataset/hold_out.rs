@@ -1,6 +1,7 @@
 //! The choice of images that are held out for evaluation.
 
 use super::capture::{Capture, View};
+use super::formats::stem;
 use super::frames::Split;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -86,33 +87,37 @@ impl Capture {
     pub fn hold_out(&mut self, chosen: &HoldOut) -> Result<()> {
         let held_out: HashSet<PathBuf> = match chosen {
             HoldOut::None => HashSet::new(),
-            HoldOut::Every(count) => {
-                let mut by_name: Vec<&View> = self.views.iter().collect();
-                by_name.sort_by_key(|view| &view.name);
-                distinct(by_name).step_by(*count).map(|view| image(view).to_owned()).collect()
-            }
+            HoldOut::Every(count) => self.every(*count),
             HoldOut::Images(names) => {
                 let image = |name: &String| Ok(image(self.named_view(name)?).to_owned());
                 names.iter().map(image).collect::<Result<_>>()?
             }
         };
-        for view in &mut self.views {
-            view.split = Some(if held_out.contains(image(view)) { Split::Test } else { Split::Train });
+        if self.views.iter().all(|view| held_out.contains(image(view))) {
+            let what = format!("holds out all {} images: leave some to train on, or use none", self.views.len());
+            return Err(Error::setting("test", what));
         }
+        self.hold_out_images(&held_out);
         Ok(())
     }
 
-    /// The first view of the image with a name: the whole name, or else an end of it, or else one without the
-    /// extension.
+    /// Every this many images by name, from the first.
+    pub(super) fn every(&self, count: usize) -> HashSet<PathBuf> {
+        let mut by_name: Vec<&View> = self.views.iter().collect();
+        by_name.sort_by_key(|view| &view.name);
+        distinct(by_name).step_by(count).map(|view| image(view).to_owned()).collect()
+    }
+
+    /// Makes these test images, and all others training images.
+    pub(super) fn hold_out_images(&mut self, held_out: &HashSet<PathBuf>) {
+        self.views.iter_mut().for_each(|view| view.split = Some(split_of(view, held_out)));
+    }
+
+    /// The first view of the image with a [fitting] name.
     fn named_view(&self, name: &str) -> Result<&View> {
-        let is_end = |path: &str| path.strip_suffix(name).is_some_and(|rest| rest.is_empty() || rest.ends_with('/'));
-        let is_stem = |path: &str| path.rsplit_once('.').is_some_and(|(stem, _)| is_end(stem));
-        let rules: [&dyn Fn(&View) -> bool; 3] =
-            [&|view| view.name == name, &|view| is_end(&view.name), &|view| is_stem(&view.name)];
-        let fitting = |rule: &dyn Fn(&View) -> bool| -> Vec<&View> {
-            distinct(self.views.iter().filter(|view| rule(view)).collect()).collect()
-        };
-        match rules.into_iter().map(fitting).find(|views| !views.is_empty()).unwrap_or_default()[..] {
+        let names = fitting(self.views.iter().map(|view| view.name.as_str()), name);
+        let views = self.views.iter().filter(|view| names.contains(&view.name.as_str())).collect();
+        match distinct(views).collect::<Vec<_>>()[..] {
             [one] => Ok(one),
             [one, two, ..] => {
                 let [one, two] = [one, two].map(|view| &view.name);
@@ -133,6 +138,30 @@ impl Capture {
 /// The file of a view's image or, if it is absent, its name.
 fn image(view: &View) -> &Path {
     view.image.as_deref().unwrap_or(Path::new(&view.name))
+}
+
+/// Test if an image is held out, or else training.
+pub(super) fn split_of(view: &View, held_out: &HashSet<PathBuf>) -> Split {
+    if held_out.contains(image(view)) { Split::Test } else { Split::Train }
+}
+
+/// The paths that fit a name best: the name itself, or else paths that end in it, or else those without their extension,
+/// or else paths that it ends in, or else any of these in another case or with another extension of images.
+pub(super) fn fitting<'a>(paths: impl Iterator<Item = &'a str> + Clone, name: &str) -> Vec<&'a str> {
+    let is_end =
+        |path: &str, end: &str| path.strip_suffix(end).is_some_and(|rest| rest.is_empty() || rest.ends_with('/'));
+    let rules: [&dyn Fn(&str) -> bool; 5] = [
+        &|path| path == name,
+        &|path| is_end(path, name),
+        &|path| path.rsplit_once('.').is_some_and(|(stem, _)| is_end(stem, name)),
+        &|path| is_end(name, path),
+        &|path| {
+            let [path, name] = [path, name].map(stem);
+            is_end(&path, &name) || is_end(&name, &path)
+        },
+    ];
+    let of = |rule: &dyn Fn(&str) -> bool| -> Vec<&'a str> { paths.clone().filter(|path| rule(path)).collect() };
+    rules.into_iter().map(of).find(|paths| !paths.is_empty()).unwrap_or_default()
 }
 
 /// The first view of each image.
@@ -175,6 +204,7 @@ mod tests {
             ("b.jpg, c", vec!["images/c.jpg", "images/b.jpg"]),
             ("d.png", vec!["images/d.png"]),
             ("more/d", vec!["more/d.jpg"]),
+            ("/data/images/B.JPG,IMAGES/C", vec!["images/b.jpg", "images/c.jpg"]),
         ] {
             let mut found = held_out(&names, chosen).unwrap();
             let mut expected: Vec<String> = expected.into_iter().map(str::to_owned).collect();
@@ -196,6 +226,8 @@ mod tests {
             ("every:x", "use every:N"),
             ("a.jpg,,", "use none, every:N or names of images separated by commas"),
             ("", "use none, every:N or names"),
+            ("a,d.png,more/d", "`test`: holds out all 3 images: leave some to train on, or use none"),
+            ("more/a.jpg", "which is no image"),
         ] {
             let message = held_out(&names, chosen).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");

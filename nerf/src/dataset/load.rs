@@ -4,7 +4,7 @@ use super::capture::{Capture, Format, View};
 use super::depth::{Depths, distances};
 use super::formats;
 use super::frames::{Dataset, Frame, Split, evenly_spaced};
-use super::hold_out::CHOOSE;
+use super::hold_out::{CHOOSE, split_of};
 use super::lens_mask::seen_pixels;
 use super::mask::Mask;
 use super::photo::{Header, Photo};
@@ -17,7 +17,7 @@ use crate::error::{Error, Result};
 use crate::memory::{available_memory, gigabytes};
 use glam::DAffine3;
 use raygrad_tensor::parallel::{self, locked};
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
@@ -88,7 +88,7 @@ impl Capture {
     ///
     /// Without splits in the files, every eighth image by name, from the first, is a [test](Split::Test) image, even if
     /// its file does not exist. The others are training images. If the files list only training images, the others are
-    /// test images.
+    /// test images; if they list only held-out images, the others are training images.
     ///
     /// # Errors
     /// If the path is absent or has no known format, a file has a bad field, or an image is in both the training and
@@ -149,21 +149,24 @@ impl Capture {
         if self.views.iter().all(|view| view.split.is_none()) {
             self.views.sort_by(|a, b| a.name.cmp(&b.name));
             let few = self.present().count() < 3;
-            for (number, view) in self.views.iter_mut().enumerate() {
-                view.split = Some(if !few && number % HELD_OUT == 0 { Split::Test } else { Split::Train });
-            }
-        } else if !self.views.iter().any(held_out) {
-            self.views.iter_mut().for_each(|view| view.split = view.split.or(Some(Split::Test)));
+            let held_out = if few { HashSet::new() } else { self.every(HELD_OUT) };
+            self.hold_out_images(&held_out);
+            return;
+        }
+        // The images that no list has are of the other kind.
+        let is_held_out = self.views.iter().any(held_out);
+        let is_trained = self.views.iter().any(|view| view.split == Some(Split::Train));
+        if !(is_held_out && is_trained) {
+            let other = if is_held_out { Split::Train } else { Split::Test };
+            self.views.iter_mut().for_each(|view| view.split = view.split.or(Some(other)));
         }
     }
 
     /// Returns whether the held-out images are every eighth by name, as [`read`](Self::read) chooses without splits in
     /// the files.
     pub fn holds_out_every_eighth(&self) -> bool {
-        let mut views: Vec<&View> = self.views.iter().collect();
-        views.sort_by(|a, b| a.name.cmp(&b.name));
-        let split = |number: usize| if number.is_multiple_of(HELD_OUT) { Split::Test } else { Split::Train };
-        views.len() > 1 && views.iter().enumerate().all(|(number, view)| view.split == Some(split(number)))
+        let held_out = self.every(HELD_OUT);
+        self.views.len() > 1 && self.views.iter().all(|view| view.split == Some(split_of(view, &held_out)))
     }
 
     /// Checks that no held-out image is also trained on.

@@ -187,7 +187,7 @@ fn other_form(one: &str, two: &str) -> &'static str {
 }
 
 /// A folded file name, without the extension of an image.
-pub(super) fn stem(name: &str) -> String {
+pub(in crate::dataset) fn stem(name: &str) -> String {
     let ending = extension(name).map_or(0, |ending| ending.len() + 1);
     folded(&name[..name.len() - ending])
 }

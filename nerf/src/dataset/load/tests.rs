@@ -57,6 +57,17 @@ fn every_eighth_image_is_held_out() {
     listed.views[1].split = Some(Split::Train);
     listed.split_by_default();
     assert_eq!(listed.split(Split::Test).unwrap().len(), 3);
+    let mut listed = capture(folder.path(), 4);
+    listed.views[1].split = Some(Split::Test);
+    listed.split_by_default();
+    assert_eq!(listed.split(Split::Train).unwrap().len(), 3, "and the reverse");
+    // Views of one image are in one split.
+    let mut twice = capture(folder.path(), 17);
+    (twice.views[0].image, twice.views[0].name) = (twice.views[16].image.clone(), "images/99.png".into());
+    twice.split_by_default();
+    twice.check_splits().unwrap();
+    assert_eq!(numbers(&twice.split(Split::Test).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
+    assert!(twice.holds_out_every_eighth());
     let mut both = capture(folder.path(), 4);
     (both.views[1].split, both.views[2].split) = (Some(Split::Train), Some(Split::Val));
     both.split_by_default();
