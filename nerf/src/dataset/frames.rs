@@ -180,12 +180,19 @@ impl Dataset {
             return Ok(());
         }
         let [low, high] = bounds;
-        let distances = self.frames.iter().map(|frame| frame.camera.pose.translation.distance(0.5 * (low + high)));
-        let mean = distances.sum::<f64>() / self.frames.len().max(1) as f64;
+        let offsets =
+            self.frames.iter().map(|Frame { camera, .. }| (0.5 * (low + high) - camera.pose.translation, camera));
+        let mean = offsets.clone().map(|(offset, _)| offset.length()).sum::<f64>() / self.frames.len().max(1) as f64;
+        let away = offsets.filter(|(offset, camera)| offset.dot(camera.pose.matrix3.z_axis) > 0.0).count();
+        let advice = match 2 * away > self.frames.len() {
+            true => {
+                "most cameras look away from it: for matrices with OpenCV's axes, negate the second and third columns"
+            }
+            false => "scale and move their positions so that the box holds the scene",
+        };
         let what = format!(
             "no ray of the {} images meets the box from {low} to {high} between the near plane {} and the far plane {}; \
-            the cameras are {mean:.3} from its centre on average: scale and move their positions so that the box \
-            holds the scene",
+            the cameras are {mean:.3} from its centre on average: {advice}; `raygrad doctor` checks the poses",
             self.frames.len(),
             self.near,
             self.far

@@ -118,7 +118,21 @@ impl SceneAnalysis {
         let reason = format!("{reason}; {looks}{sideways}");
         let distance = median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
         if !(distance > 1e-9 * (1.0 + middle.length())) {
-            let what = "has all cameras in one place, so the scene has no scale; check the positions of the poses";
+            let (count, total) = (cameras.len(), capture.views.len());
+            let absent = capture.views.iter().find(|view| view.image.is_none());
+            if let Some(absent) = absent.filter(|_| 2 * count < total) {
+                let what = format!(
+                    "only {count} of {total} images exist, all from one place (the first absent one is `{}`); correct \
+                     the paths or copy the images there",
+                    absent.name
+                );
+                return Err(Error::field(&capture.file, &absent.field, what));
+            }
+            let what = format!(
+                "has all cameras in one place, so the scene has no scale: check the last columns of the matrices; \
+                 `raygrad doctor {}` finds world-to-camera matrices and other conventions",
+                capture.folder.display()
+            );
             return Err(Error::file(&capture.file, what));
         }
         let half = match scene_type {

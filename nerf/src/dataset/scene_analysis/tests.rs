@@ -368,7 +368,11 @@ fn scene_type_flag_beats_convention_beats_alpha() {
 fn captures_without_size_or_images_are_errors() {
     let mut one = capture(Format::Colmap, vec![quarter(4.0)[0].clone(); 5]);
     let message = SceneAnalysis::new(&one, None, None).unwrap_err().to_string();
-    assert!(message.contains("one place"), "{message}");
+    assert!(message.contains("one place") && message.contains("`raygrad doctor "), "{message}");
+    // Most images are absent.
+    one.views[1..].iter_mut().for_each(|view| view.image = None);
+    let message = SceneAnalysis::new(&one, None, None).unwrap_err().to_string();
+    assert!(message.contains("`frames[1]`: only 1 of 5 images exist, all from one place (the first"), "{message}");
     one.views.iter_mut().for_each(|view| view.image = None);
     let message = SceneAnalysis::new(&one, None, None).unwrap_err().to_string();
     assert!(

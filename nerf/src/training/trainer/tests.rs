@@ -30,14 +30,15 @@ fn cameras_without_view_of_the_box_are_an_error() {
     }
     let message = Trainer::new(tiny(), Arc::new(data.clone())).err().unwrap().to_string();
     let expected = "no ray of the 3 images meets the box";
-    assert!(message.contains(expected) && message.contains("on average"), "{message}");
+    assert!(message.contains(expected) && message.contains("on average: scale and move"), "{message}");
     // One camera that sees a part is enough.
     data.frames[2].camera.pose.translation /= 3.0;
     Trainer::new(tiny(), Arc::new(data.clone())).unwrap();
     // Near enough, but looking away.
     data.frames.drain(..2);
     data.frames[0].camera.pose.matrix3 = -data.frames[0].camera.pose.matrix3;
-    assert!(data.check_reach(data.bounds).is_err());
+    let message = data.check_reach(data.bounds).unwrap_err().to_string();
+    assert!(message.contains("most cameras look away from it: for matrices with OpenCV's axes, negate"), "{message}");
 }
 
 #[test]
