@@ -12,10 +12,16 @@ use serde_json::{Map, Value};
 use std::f64::consts::PI;
 
 /// Unsupported camera fields of instant-ngp and nerfstudio. Ignoring them silently would spoil every image.
-const NOT_READ: [&str; 14] = [
+const NOT_READ: [&str; 20] = [
     "x_fov",
     "y_fov",
     "distortion_params",
+    "dist_coeffs",
+    "dist",
+    "distortion",
+    "distortion_coefficients",
+    "radial_distortion",
+    "tangential_distortion",
     "fisheye_crop_radius",
     "ftheta_p0",
     "ftheta_p1",
@@ -29,10 +35,15 @@ const NOT_READ: [&str; 14] = [
     "transform_matrix_end",
 ];
 
-/// Names of a 3x3 intrinsic matrix: focal lengths on the diagonal, the principal point in the last column.
-const MATRICES: [&str; 5] = ["K", "intrinsics", "camera_intrinsics", "intrinsic_matrix", "camera_matrix"];
+/// Names of an intrinsic matrix (focal lengths on the diagonal, the principal point in the last column), and of a list or
+/// object of fx, fy, cx and cy.
+const MATRICES: [&str; 6] = ["K", "intrinsics", "camera_intrinsics", "intrinsic_matrix", "camera_matrix", "cam_K"];
 
-/// The least focal length of such a matrix, as a share of the image's side: some matrices are in units of the side.
+/// Names of a focal length that may be in millimetres.
+const FOCAL_LENGTHS: [&str; 2] = ["focal_length", "focal"];
+
+/// The least focal length of other names than instant-ngp's, as a share of the image's side: some are in units of the
+/// side.
 const SHORTEST: f64 = 0.05;
 
 /// The largest difference of two values of a length, in pixels.
@@ -57,17 +68,27 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     fn nothing(value: &Value) -> bool {
         match value {
             Value::Bool(flag) => !flag,
-            Value::Number(value) => value.as_f64() == Some(0.0),
             Value::Array(values) => values.iter().all(nothing),
-            _ => false,
+            Value::Object(members) => members.values().all(nothing),
+            value => number(value) == Some(0.0),
         }
     }
-    let named = NOT_READ.into_iter().find_map(|name| Some((name, object.get(name).filter(|value| !nothing(value))?)));
+    // A number `dist` is a distance.
+    let is_read = |name: &str, value: &Value| nothing(value) || name == "dist" && value.is_number();
+    let named = NOT_READ.into_iter().find_map(|name| Some((name, object.get(name).filter(|x| !is_read(name, x))?)));
     let Some((name, value)) = named else { return Ok(()) };
     let what = match name {
         "x_fov" | "y_fov" => "write the field of view in radians as camera_angle_x and camera_angle_y",
         "latlong" | "equirectangular" => "write camera_model EQUIRECTANGULAR for such panoramas",
         "distortion_params" => "write the coefficients by name (k1, k2, p1, p2) with their camera_model",
+        "dist_coeffs"
+        | "dist"
+        | "distortion"
+        | "distortion_coefficients"
+        | "radial_distortion"
+        | "tangential_distortion" => {
+            "write the coefficients by name (k1, k2, p1, p2) with their camera_model; OpenCV lists k1, k2, p1, p2, k3"
+        }
         "fisheye_crop_radius" => "write masks of the pixels to use, as mask_path",
         "rolling_shutter" | "transform_matrix_start" | "transform_matrix_end" => {
             "rolling shutter is not supported; remove it to ignore it"
@@ -116,8 +137,15 @@ impl Layers<'_, '_> {
             let focal = self.panorama([width, height])?;
             return Ok(Camera { width, height, focal, centre: middle, lens, pose });
         }
-        let [x, y] = self.centre()?;
-        let centre = [x.unwrap_or(middle[0]), y.unwrap_or(middle[1])];
+        let given = self.centre()?;
+        for (i, side) in [width, height].map(|side| side as f64).into_iter().enumerate() {
+            // Crops may lie beside the principal point, but not far from it.
+            if let Some(x) = given[i].filter(|x| side > 0.0 && !(-side..=2.0 * side).contains(x)) {
+                let what = format!("is {x}, far outside of an image {side} wide or high: scale it with the image");
+                return Err(self.error(["cx", "cy"][i], what));
+            }
+        }
+        let centre = [0, 1].map(|i| given[i].unwrap_or(middle[i]));
         let focal = self.focal([width, height], angle_y)?;
         Ok(Camera { width, height, focal, centre, lens, pose })
     }
@@ -125,10 +153,7 @@ impl Layers<'_, '_> {
     /// The principal point, if the frame or the file gives it.
     pub(super) fn centre(&self) -> Result<[Option<f64>; 2]> {
         let axis = |i: usize, name: &str| {
-            let of = |object: &Object<'_>| {
-                let of_matrix = matrix_of(object)?.map(|matrix| matrix[2 + i]);
-                agreeing(object, name, object.number(name)?, of_matrix)
-            };
+            let of = |object: &Object<'_>| agreeing(object, name, &OtherNames::of(object)?, 2 + i);
             let value = of(self.frame)?.map_or_else(|| of(self.top), |own| Ok(Some(own)))?;
             match value.filter(|value| value.abs() > CENTRE) {
                 Some(value) => Err(self.error(name, format!("must be a position in pixels, is {value}"))),
@@ -146,7 +171,17 @@ impl Layers<'_, '_> {
         match (given, top) {
             ([Some(x), Some(y)], _) => Ok([x, y]),
             ([None, None], _) => {
-                let what = "is missing: give the horizontal field of view in radians, or focal lengths in pixels as fl_x and fl_y";
+                let unread = [self.frame, self.top].into_iter().find_map(|object| {
+                    let mut names = MATRICES.into_iter().chain(FOCAL_LENGTHS);
+                    names.find_map(|name| Some((object.field(name), object.get(name)?)))
+                });
+                let unread =
+                    unread.map(|(field, value)| format!("; raygrad does not read `{field}`, {}", shown(value)));
+                let what = format!(
+                    "is missing: give the horizontal field of view in radians, or focal lengths in pixels as fl_x and \
+                     fl_y{}",
+                    unread.unwrap_or_default()
+                );
                 Err(self.top.error("camera_angle_x", what))
             }
             // Programs disagree on the other one: the file's, or the frame's for both axes.
@@ -202,14 +237,14 @@ impl Layers<'_, '_> {
 
 /// The focal lengths that one object gives: `fl_x` and `fl_y`, or else the angles.
 fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Option<f64>; 2]> {
-    let matrix = matrix_of(object)?;
+    let others = OtherNames::of(object)?;
     let axis = |length: &str, angle: &str, side: usize| {
-        let of_matrix = matrix.map(|matrix| matrix[usize::from(length == "fl_y")]);
-        let own = object.number(length)?;
-        if let Some(f) = agreeing(object, length, own, of_matrix)? {
-            if own.is_none() && f < SHORTEST * side as f64 {
-                let what =
-                    format!("is {f} in the intrinsic matrix, which must be in pixels, of an image {side} wide or high");
+        if let Some(f) = agreeing(object, length, &others, usize::from(length == "fl_y"))? {
+            if object.get(length).is_none() && f < SHORTEST * side as f64 {
+                let what = format!(
+                    "is {f} in `{}`, which must be in pixels, of an image {side} wide or high",
+                    object.field(others.name)
+                );
                 return Err(object.error(length, what));
             }
             if !FOCAL.contains(&f) {
@@ -250,38 +285,74 @@ fn focal_length(side: usize, angle: f64) -> f64 {
     0.5 * side as f64 / (0.5 * angle).tan()
 }
 
-/// The focal lengths and the principal point of an object's intrinsic matrix, if it has one.
-fn matrix_of(object: &Object<'_>) -> Result<Option<[f64; 4]>> {
-    let Some((name, value)) =
-        MATRICES.iter().find_map(|name| Some((name, object.get(name).filter(|value| value.is_array())?)))
-    else {
-        return Ok(None);
-    };
-    // Lists of other shapes belong to other programs.
-    let Some(entries) = entries(value, 3).filter(|entries| entries.len() == 9) else { return Ok(None) };
-    let m: Option<Vec<f64>> = entries.into_iter().map(number).collect();
-    let m: Option<[f64; 9]> = m.filter(|m| m.iter().all(|x| x.is_finite())).and_then(|m| m.try_into().ok());
-    let Some(m) = m else {
-        return Err(object.error(name, format!("must be a 3x3 intrinsic matrix, is {}", shown(value))));
-    };
-    // Some programs store columns. Only the principal point can stand outside of the diagonal.
-    let ([fx, fy], skew, rest) = ([m[0], m[4]], [m[1], m[3]], m[8]);
-    let [right, below] = [[m[2], m[5]], [m[6], m[7]]];
-    let (centre, other) = if right == [0.0; 2] { (below, right) } else { (right, below) };
-    if skew != [0.0; 2] || other != [0.0; 2] || rest != 1.0 {
-        let what = "must have the rows fx 0 cx, 0 fy cy and 0 0 1";
-        return Err(object.error(name, format!("{what}, is {}", shown(value))));
-    }
-    Ok(Some([fx, fy, centre[0], centre[1]]))
+/// The focal lengths and the principal point of an object, under other names than instant-ngp's.
+#[derive(Default)]
+struct OtherNames {
+    /// The member that has them.
+    name: &'static str,
+    /// fx, fy, cx and cy.
+    lengths: [Option<f64>; 4],
 }
 
-/// A length that is given by its own member, by the intrinsic matrix, or equally by both.
-fn agreeing(object: &Object<'_>, name: &str, own: Option<f64>, of_matrix: Option<f64>) -> Result<Option<f64>> {
-    match (own, of_matrix) {
-        (Some(own), Some(other)) if !((own - other).abs() <= SAME) => {
-            Err(object.error(name, format!("is {own}, but the intrinsic matrix has {other}: remove one of them")))
+impl OtherNames {
+    fn of(object: &Object<'_>) -> Result<Self> {
+        for name in MATRICES {
+            // Values of other shapes belong to other programs.
+            let Some((value, entries)) = object.get(name).and_then(|value| Some((value, entries_of(value)?))) else {
+                continue;
+            };
+            let m: Option<Vec<f64>> = entries.into_iter().map(|x| number(x).filter(|x| x.is_finite())).collect();
+            let lengths = m.ok_or("must have finite numbers").and_then(|m| lengths(&m));
+            let lengths = lengths.map_err(|what| object.error(name, format!("{what}, is {}", shown(value))))?;
+            return Ok(OtherNames { name, lengths: lengths.map(Some) });
         }
-        (own, of_matrix) => Ok(own.or(of_matrix)),
+        if ["fl_x", "fl_y"].iter().any(|name| object.get(name).is_some()) {
+            return Ok(OtherNames::default());
+        }
+        let [fx, fy] = [object.number("fx")?, object.number("fy")?];
+        Ok(OtherNames { name: if fx.is_some() { "fx" } else { "fy" }, lengths: [fx, fy, None, None] })
+    }
+}
+
+/// The entries of a 3x3, 3x4 or 4x4 matrix, row by row, or fx, fy, cx and cy of a list or an object of nothing else.
+fn entries_of(value: &Value) -> Option<Vec<&Value>> {
+    match value {
+        Value::Object(members) if members.len() == 4 => {
+            ["fx", "fy", "cx", "cy"].into_iter().map(|name| members.get(name)).collect()
+        }
+        Value::Array(list) if list.len() == 4 && !list.iter().any(Value::is_array) => Some(list.iter().collect()),
+        value => entries(value, 3)
+            .filter(|entries| entries.len() == 9)
+            .or_else(|| entries(value, 4).filter(|entries| matches!(entries.len(), 12 | 16))),
+    }
+}
+
+/// fx, fy, cx and cy of their list or of an intrinsic matrix; or an error message.
+fn lengths(m: &[f64]) -> std::result::Result<[f64; 4], &'static str> {
+    if let [fx, fy, cx, cy] = *m {
+        return Ok([fx, fy, cx, cy]);
+    }
+    let columns = if m.len() == 9 { 3 } else { 4 };
+    let at = |row: usize, column: usize| m[row * columns + column];
+    let is_nothing = |values: [f64; 2]| values.iter().all(|x| x.abs() <= SAME);
+    let is_rest_nothing = (0..m.len()).all(|i| i % columns < 3 && i / columns < 3 || m[i] == f64::from(i == 15));
+    // Some programs store columns. Only the principal point can stand outside of the diagonal.
+    let [right, below] = [[at(0, 2), at(1, 2)], [at(2, 0), at(2, 1)]];
+    let (centre, other) = if right == [0.0; 2] { (below, right) } else { (right, below) };
+    match is_nothing([at(0, 1), at(1, 0)]) && other == [0.0; 2] && at(2, 2) == 1.0 && is_rest_nothing {
+        true => Ok([at(0, 0), at(1, 1), centre[0], centre[1]]),
+        false => Err("must have the rows fx 0 cx, 0 fy cy and 0 0 1"),
+    }
+}
+
+/// A length that is given by its own member, by the other names, or equally by both.
+fn agreeing(object: &Object<'_>, name: &str, others: &OtherNames, i: usize) -> Result<Option<f64>> {
+    match (object.number(name)?, others.lengths[i]) {
+        (Some(own), Some(other)) if !((own - other).abs() <= SAME) => {
+            let field = object.field(others.name);
+            Err(object.error(name, format!("is {own}, but `{field}` has {other}: remove one of them")))
+        }
+        (own, other) => Ok(own.or(other)),
     }
 }
 

@@ -309,6 +309,12 @@ fn unsupported_camera_fields_are_named() {
         ("x_fov", json!(45.8), "camera_angle_x"),
         ("y_fov", json!(45.8), "camera_angle_y"),
         ("distortion_params", json!([0.1, 0]), "k1, k2, p1, p2"),
+        ("dist_coeffs", json!([[-0.4, 0.1, 0, 0, 0]]), "OpenCV lists k1, k2, p1, p2, k3"),
+        ("distortion_coefficients", json!({ "k1": 0.1 }), "k1, k2, p1, p2"),
+        ("distortion", json!([0.1]), "k1, k2, p1, p2"),
+        ("radial_distortion", json!(["0.1"]), "k1, k2, p1, p2"),
+        ("tangential_distortion", json!([0.1]), "k1, k2, p1, p2"),
+        ("dist", json!([0.1]), "k1, k2, p1, p2"),
         ("fisheye_crop_radius", json!(500.0), "mask_path"),
         ("ftheta_p0", json!(1e-3), "not supported"),
         ("ftheta_p4", json!("NaN"), "not supported"),
@@ -320,10 +326,15 @@ fn unsupported_camera_fields_are_named() {
     ] {
         fails(|d| d[name] = value.clone(), &[&format!("`{name}`: is "), hint, "which raygrad does not read"]);
         fails(|d| d["frames"][1][name] = value, &[&format!("`frames[1].{name}`: is "), hint]);
-        for nothing in [json!(null), json!(false), json!(0), json!([0, 0.0, 0]), json!([])] {
+        for nothing in [json!(null), json!(false), json!(0), json!([0, 0.0, [0]]), json!([]), json!({ "k1": "0" })] {
             assert_eq!(cameras(|d| d[name] = nothing), cameras(|_| {}), "{name}");
         }
     }
+}
+
+#[test]
+fn distances_are_no_distortion() {
+    assert_eq!(cameras(|d| d["dist"] = json!(4.5)), cameras(|_| {}));
 }
 
 #[test]
@@ -424,11 +435,8 @@ fn intrinsic_matrices_are_read_in_all_forms() {
     assert_eq!((of_frame[1].focal, of_frame[1].centre), ([90.0, 95.0], [30.0, 20.0]));
     // The same lengths twice.
     assert_eq!(cameras(|d| d["K"] = rows.clone()), plain);
-    fails(
-        |d| d["K"] = json!([[101, 0, 31], [0, 110, 25], [0, 0, 1]]),
-        &["`fl_x`: is 100", "matrix has 101: remove one"],
-    );
-    fails(|d| d["K"] = json!([[100, 0, 31], [0, 110, 26], [0, 0, 1]]), &["`cy`: is 25", "matrix has 26: remove one"]);
+    fails(|d| d["K"] = json!([[101, 0, 31], [0, 110, 25], [0, 0, 1]]), &["`fl_x`: is 100", "`K` has 101: remove one"]);
+    fails(|d| d["K"] = json!([[100, 0, 31], [0, 110, 26], [0, 0, 1]]), &["`cy`: is 25", "`K` has 26: remove one"]);
     for matrix in [
         json!([[100, 1, 31], [0, 110, 25], [0, 0, 1]]),
         json!([[100, 0, 31], [0, 110, 25], [1, 0, 1]]),
@@ -436,18 +444,61 @@ fn intrinsic_matrices_are_read_in_all_forms() {
     ] {
         fails(|d| d["K"] = matrix, &["`K`: must have the rows fx 0 cx, 0 fy cy and 0 0 1"]);
     }
-    fails(|d| d["K"] = json!([1, 2, "x", 4, 5, 6, 7, 8, 9]), &["`K`: must be a 3x3 intrinsic matrix"]);
+    fails(|d| d["K"] = json!([1, 2, "x", 4, 5, 6, 7, 8, 9]), &["`K`: must have finite numbers, is [1,2,\"x\""]);
     let of_sides = json!([[1.5, 0, 0.5], [0, 1.5, 0.5], [0, 0, 1]]);
     fails(
         |d| {
             lengths.iter().for_each(|length| remove(d, length));
             d["K"] = of_sides;
         },
-        &["`fl_x`: is 1.5 in the intrinsic matrix, which must be in pixels, of an image 64 wide"],
+        &["`fl_x`: is 1.5 in `K`, which must be in pixels, of an image 64 wide"],
     );
     // Other programs' members of these names.
     for other in [json!([]), json!([[100, 0, 31], [0, 110, 25]]), json!([[1]]), json!([[1, 2, 3, 4]])] {
         assert_eq!(cameras(|d| d["K"] = other), plain);
     }
     assert_eq!(cameras(|d| d["intrinsics"] = json!({ "fx": 1 })), plain);
+}
+
+#[test]
+fn focal_lengths_under_other_names_are_read() {
+    let plain = cameras(|_| {});
+    let with = |fields: Value| {
+        move |d: &mut Value| {
+            ["fl_x", "fl_y", "cx", "cy"].iter().for_each(|length| remove(d, length));
+            set(d, &fields);
+        }
+    };
+    let wide = json!([[100, 0, 31, 0], [0, 110, 25, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
+    for fields in [
+        json!({ "intrinsics": wide }),
+        json!({ "intrinsics": wide.as_array().unwrap()[..3] }),
+        json!({ "intrinsics": [100, 0, 31, 0, 0, 110, 25, 0, 0, 0, 1, 0] }),
+        json!({ "intrinsics": [100, "110", 31, 25] }),
+        json!({ "intrinsics": { "fx": 100, "fy": 110, "cx": 31, "cy": 25 } }),
+        json!({ "cam_K": [[100, 1e-9, 31], [0, 110, 25], [0, 0, 1]] }),
+        json!({ "fx": 100, "fy": 110, "cx": 31, "cy": 25 }),
+        json!({ "camera_matrix": [], "K": [100, 110, 31, 25] }),
+    ] {
+        assert_eq!(cameras(with(fields.clone())), plain, "{fields}");
+    }
+    // The usual name counts.
+    assert_eq!(cameras(|d| d["fx"] = json!(7)), plain);
+    // A projection matrix, units of the side, and values that something else explains.
+    let projection = json!([[100, 0, 31, 5], [0, 110, 25, 0], [0, 0, 1, 0]]);
+    fails(with(json!({ "K": projection })), &["`K`: must have the rows fx 0 cx"]);
+    fails(with(json!({ "fx": 0.9, "fy": 0.9 })), &["`fl_x`: is 0.9 in `fx`, which must be in pixels"]);
+    fails(with(json!({ "K": [100, 110, 31, "NaN"] })), &["`K`: must have finite numbers, is [100,110,31,"]);
+    let phone = json!({ "fx": 100, "fy": 110, "cx": 31, "cy": 25, "width": 1920 });
+    for (name, value) in [("intrinsics", phone), ("focal_length", json!(4.2))] {
+        let unread = format!("raygrad does not read `{name}`, ");
+        fails(with(json!({ name: value })), &["`camera_angle_x`: is missing", "as fl_x and fl_y", &unread]);
+    }
+}
+
+#[test]
+fn principal_points_far_outside_of_the_image_are_named() {
+    assert_eq!(cameras(|d| d["cx"] = json!(-20))[0].centre, [-20.0, 25.0], "crops may lie beside it");
+    fails(|d| d["cx"] = json!(527), &["`cx`: is 527, far outside of an image 64 wide or high: scale it"]);
+    fails(|d| d["frames"][1]["cy"] = json!(-50), &["`frames[1].cy`: is -50, far outside of an image 48"]);
 }

@@ -215,7 +215,7 @@ fn any_camera_numbers_round_trip() {
     capture.views.truncate(1);
     let numbers = (
         prop::array::uniform2(1e-3..1e9_f64),
-        prop::array::uniform2(-1e9..1e9_f64),
+        prop::array::uniform2(-2.0..4.0_f64),
         prop::array::uniform6(-1.0..1.0_f64),
         prop::array::uniform2(-1.0..1.0_f64),
         -4.0..4.0_f64,
