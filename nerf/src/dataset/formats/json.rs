@@ -17,6 +17,11 @@ pub(super) fn number(value: &Value) -> Option<f64> {
     value.as_f64().or_else(|| value.as_str()?.trim().parse().ok())
 }
 
+/// Returns true if a member counts as absent: null or an empty string, as some programs write it.
+fn is_empty(value: &Value) -> bool {
+    value.is_null() || value.as_str().is_some_and(|text| text.trim().is_empty())
+}
+
 /// Reads and parses a file.
 pub(super) fn read(file: &Path) -> Result<Value> {
     let bytes = std::fs::read(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")))?;
@@ -105,9 +110,9 @@ impl<'a> Object<'a> {
         frames.iter().enumerate().map(object).collect()
     }
 
-    /// A member, or that of its [other name](OTHER_NAMES); `None` if it is absent or null.
+    /// A member, or that of its [other name](OTHER_NAMES); `None` if it is absent, null or an empty string.
     pub(super) fn get(&self, name: &str) -> Option<&'a Value> {
-        let member = |name: &str| self.members.get(name).filter(|value| !value.is_null());
+        let member = |name: &str| self.members.get(name).filter(|value| !is_empty(value));
         let other = || OTHER_NAMES.iter().find(|(usual, _)| *usual == name).and_then(|(_, other)| member(other));
         member(name).or_else(other)
     }

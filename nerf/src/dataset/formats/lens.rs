@@ -20,17 +20,19 @@ fn has(model: &Model, coefficient: &str) -> bool {
 
 /// The lens of a file.
 ///
-/// Without a camera model it is OPENCV, or OPENCV_FISHEYE if `is_fisheye` is true, as in instant-ngp. A Brown lens
-/// without distortion becomes a pinhole.
+/// Without a camera model it is OPENCV, or OPENCV_FISHEYE if `is_fisheye` is true, as in instant-ngp. "Perspective" is
+/// OPENCV. A Brown lens without distortion becomes a pinhole.
 pub(super) fn read(layers: &Layers<'_, '_>) -> Result<Lens> {
     let fisheye = layers.find("is_fisheye", |object, name| object.flag(name))?;
     let named = layers.find("camera_model", |object, name| object.text(name))?;
     let default = if fisheye == Some(true) { "OPENCV_FISHEYE" } else { "OPENCV" };
-    let name = named.unwrap_or(default);
+    let name = named.map_or(default, str::trim);
+    let name = if name.eq_ignore_ascii_case("perspective") { "OPENCV" } else { name };
     let Some(model) = Model::named(name) else {
         let known = MODELS.map(|model| model.name).join(", ");
         return Err(layers.error("camera_model", format!("is {:.40}; use one of {known}", name.escape_debug())));
     };
+    let name = model.name;
     if fisheye.is_some_and(|fisheye| fisheye != matches!(model.kind, Lens::Fisheye { .. })) {
         let what = format!("contradicts `camera_model`, which is {name}: remove one of them");
         return Err(layers.error("is_fisheye", what));

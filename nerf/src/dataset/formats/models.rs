@@ -43,9 +43,9 @@ pub(super) const MODELS: [Model; 14] = [
 ];
 
 impl Model {
-    /// The model of this name.
+    /// The model of this name, in any case.
     pub fn named(name: &str) -> Option<&'static Model> {
-        MODELS.iter().find(|model| model.name == name)
+        MODELS.iter().find(|model| model.name.eq_ignore_ascii_case(name))
     }
 
     /// The lens with these coefficients, by name.

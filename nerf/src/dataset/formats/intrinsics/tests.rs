@@ -260,13 +260,28 @@ fn is_fisheye_selects_the_fisheye_model() {
 
 #[test]
 fn unknown_models_are_named() {
-    for model in ["OPENCV5", "opencv", "FISHEYE624", "ORTHOPHOTO", "VR180_L", "OMNIDIRECTIONALSTEREO_L", ""] {
+    for model in ["OPENCV5", "opencv 5", "FISHEYE624", "ORTHOPHOTO", "VR180_L", "OMNIDIRECTIONALSTEREO_L"] {
         fails(
             |d| d["camera_model"] = json!(model),
             &["`camera_model`", &format!("is {model}; use one of "), "THIN_PRISM_FISHEYE"],
         );
         fails(|d| d["frames"][1]["camera_model"] = json!(model), &["`frames[1].camera_model`"]);
     }
+    let distorted = with(json!({ "k1": 0.1, "camera_model": "OPENCV" }));
+    for model in ["opencv", " OpenCV", "Perspective", ""] {
+        assert_eq!(with(json!({ "k1": 0.1, "camera_model": model })), distorted, "{model}");
+    }
+    for model in ["pinhole", "perspective"] {
+        assert_eq!(with(json!({ "camera_model": model })), cameras(|_| {})[0], "{model}");
+    }
+    // An empty name in a frame leaves that of the file.
+    let top = json!({ "camera_model": "opencv_fisheye", "k1": 0.1 });
+    let of_frame = cameras(|d| {
+        set(d, &top);
+        d["frames"][1]["camera_model"] = json!("");
+    });
+    assert!(of_frame[0] == of_frame[1] && matches!(of_frame[1].lens, Lens::Fisheye { .. }));
+    fails(|d| set(d, &json!({ "camera_model": "pinhole", "k1": 0.1 })), &["`k1`: is 0.1", "PINHOLE has no such"]);
     fails(|d| d["camera_model"] = json!(4), &["`camera_model`: must be a string, is 4"]);
     fails(|d| d["camera_model"] = json!("a\nb".repeat(50)), &["`camera_model`"]);
 }
