@@ -5,7 +5,7 @@
 //! Blender's sensor.
 
 use super::frames::{Dialect, Frames};
-use super::json::{self, Object};
+use super::json::{self, Object, unused};
 use super::{matrix, paths};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -72,7 +72,7 @@ pub(super) fn read_files(folder: &Path, needed: bool) -> Result<Capture> {
         if i > 0 {
             views.iter_mut().for_each(|view| view.field = format!("{} {}", name_of(*split), view.field));
         }
-        aabb_scale = aabb_scale.or(tops[i].positive("aabb_scale")?);
+        aabb_scale = aabb_scale.or(unused(tops[i].positive("aabb_scale"), &mut assumptions));
     }
     let views = views.into_iter().flatten().collect();
     Ok(Capture { aabb_scale, assumptions, ..Capture::new(folder, first.clone(), Format::Blender, views) })

@@ -1,7 +1,7 @@
 //! The frames of a JSON file as views.
 
 use super::intrinsics::check_known;
-use super::json::Object;
+use super::json::{Object, first_of, unused};
 use super::layers::Layers;
 use super::locate::{Located, locate};
 use super::{masks, matrix, paths};
@@ -94,6 +94,7 @@ impl Frames {
         let first = frames.iter().zip(images).find_map(|(frame, (_, image))| Some((frame, image.as_ref()?)));
         let (mut common, mut unclear, mut contradicting) = (None, BTreeSet::new(), None);
         let mut views = Vec::with_capacity(frames.len());
+        let mut blunt = vec![];
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
             check_known(frame)?;
             let pose = match matrix::pose(frame, "transform_matrix")? {
@@ -126,11 +127,11 @@ impl Frames {
                 image: image.as_ref().map(|image| image.path.clone()),
                 mask: needed(frame, "mask_path", &masks[i], image.is_some())?,
                 depth: depths.of_frame(i, &layers[i], image.is_some())?,
-                sharpness: frame.number("sharpness")?,
+                sharpness: unused(frame.number("sharpness"), &mut blunt),
                 ..View::new(name, &frame.path, camera)
             });
         }
-        self.assumptions.extend(contradicting);
+        self.assumptions.extend(contradicting.into_iter().chain(first_of(&blunt)));
         if let Some(first) = unclear.first() {
             let first = first.strip_prefix(folder).unwrap_or(first).display();
             // Of Blender's images, a single header is read.
@@ -241,11 +242,11 @@ impl Depths {
 
     /// The file and unit of a frame.
     fn of_frame(&self, i: usize, layers: &Layers<'_, '_>, has_image: bool) -> Result<Option<(PathBuf, f64)>> {
-        let unit = layers.find("depth_unit_scale_factor", |object, name| object.positive(name))?;
         if let Some(path) = needed(layers.frame, "depth_file_path", &self.nerfstudio[i], has_image)? {
             // Float arrays are in scene units.
             let floats = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npy"));
             let default = if floats { 1.0 } else { DEPTH_UNIT };
+            let unit = layers.find("depth_unit_scale_factor", |object, name| object.positive(name))?;
             return Ok(Some((path, unit.unwrap_or(default))));
         }
         let path = needed(layers.frame, "depth_path", &self.ngp[i], has_image)?;

@@ -1,6 +1,7 @@
 //! JSON documents whose errors name the field.
 
 use super::encodings::decoded;
+use super::points::reason;
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use serde_json::{Map, Value};
@@ -20,6 +21,23 @@ pub(super) fn number(value: &Value) -> Option<f64> {
 /// Returns true if a member counts as absent: null or an empty string, as some programs write it.
 fn is_empty(value: &Value) -> bool {
     value.is_null() || value.as_str().is_some_and(|text| text.trim().is_empty())
+}
+
+/// A field that training does not use. If it is wrong, it counts as absent, with a note.
+pub(super) fn unused<T>(field: Result<Option<T>>, notes: &mut Vec<String>) -> Option<T> {
+    field.unwrap_or_else(|error| {
+        notes.push(format!("ignored {}", reason(error)));
+        None
+    })
+}
+
+/// The first of several notes that differ in names alone, with the number of the others.
+pub(super) fn first_of(notes: &[String]) -> Option<String> {
+    let others = match notes.len() {
+        0 | 1 => String::new(),
+        count => format!(", and {} more likewise", count - 1),
+    };
+    notes.first().map(|first| first.clone() + &others)
 }
 
 /// Reads and parses a file.

@@ -4,7 +4,7 @@
 //! unchanged: instant-ngp's `scale` and `offset`, and other fields that do not affect cameras, are ignored.
 
 use super::frames::{Dialect, Frames};
-use super::json::{self, Object, shown};
+use super::json::{self, Object, shown, unused};
 use super::{intrinsics, lens, matrix, paths, ply};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -45,22 +45,25 @@ pub fn read(folder: &Path) -> Result<Capture> {
 pub(super) fn read_file(folder: &Path, file: &Path, needed: bool) -> Result<Capture> {
     let document = json::read(file)?;
     let top = Object::top(file, &document)?;
-    let Frames { views, left_out, assumptions, .. } =
+    let Frames { views, left_out, mut assumptions, .. } =
         Frames::read(std::slice::from_ref(&top), folder, Dialect::Transforms)?;
     let mut views: Vec<View> = views.into_iter().flatten().collect();
     if needed {
         read_splits(&top, &mut views, &left_out)?;
     }
-    let scale = top.positive("applied_scale")?.unwrap_or(1.0);
-    let transform = matrix::affine(&top, "applied_transform")?.unwrap_or(DAffine3::IDENTITY);
+    let notes = &mut assumptions;
+    let scale = unused(top.positive("applied_scale"), notes).unwrap_or(1.0);
+    let transform = unused(matrix::affine(&top, "applied_transform"), notes).unwrap_or(DAffine3::IDENTITY);
     // nerfstudio scales after the transform.
     let applied = DAffine3 { matrix3: scale * transform.matrix3, translation: scale * transform.translation };
-    let aabb_scale = top.positive("aabb_scale")?;
+    let aabb_scale = unused(top.positive("aabb_scale"), notes);
+    let points = top.get("ply_file_path").map(|path| paths::normal(&top, "ply_file_path", path)).transpose();
+    let points = unused(points, notes);
     let capture = Capture::new(folder, file.to_owned(), Format::Transforms, views);
     let mut capture = Capture { aabb_scale, applied, assumptions, ..capture };
-    if let Some(path) = top.get("ply_file_path") {
+    if let Some(path) = points {
         // The points are in the coordinates of the file: nerfstudio transforms them together with the cameras.
-        let file = folder.join(paths::normal(&top, "ply_file_path", path)?);
+        let file = folder.join(path);
         ply::read(&file).attach(&mut capture, &file);
     }
     Ok(capture)

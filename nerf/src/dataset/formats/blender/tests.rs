@@ -114,6 +114,7 @@ fn bad_fields_are_named() {
     fails(|d| remove(d, "camera_angle_x"), &["`camera_angle_x`: is missing"]);
     fails(|d| remove(&mut d["frames"][1], "file_path"), &["`frames[1].file_path`: is missing"]);
     fails(|d| remove(&mut d["frames"][1], "transform_matrix"), &["`frames[1].transform_matrix`: is missing"]);
+    assert_eq!(good(|d| d["aabb_scale"] = json!(0)).assumptions, ["ignored `aabb_scale`: must be above 0, is 0"]);
     fails(|d| d["frames"][1]["transform_matrix"][2][2] = json!(-1), &["`frames[1].transform_matrix`", "mirrors"]);
     fails(|d| d["frames"] = json!([]), &["`frames`: is empty"]);
     let folder = folder(|_| {});
