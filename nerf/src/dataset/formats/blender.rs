@@ -53,6 +53,10 @@ pub(super) fn read_files(folder: &Path, needed: bool) -> Result<Capture> {
             continue;
         }
         match json::read(&file) {
+            // Some programs write all three files.
+            Ok(document) if !documents.is_empty() && document["frames"].as_array().is_some_and(Vec::is_empty) => {
+                notes.push(format!("`{}` has no frames", name_of(split)));
+            }
             Ok(document) => documents.push((split, document, file)),
             Err(error) if needed || documents.is_empty() => return Err(error),
             Err(error) => notes.push(format!("left out the frames of {error}")),

@@ -4,18 +4,18 @@
 //! unchanged: instant-ngp's `scale` and `offset`, and other fields that do not affect cameras, are ignored.
 
 use super::frames::{Dialect, Frames};
-use super::json::{self, Object, shown, unused};
+use super::json::{self, Object, first_of, shown, unused};
 use super::{intrinsics, lens, matrix, paths, ply};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
 use crate::dataset::frames::Split;
-use crate::dataset::hold_out::CHOOSE;
+use crate::dataset::hold_out::{CHOOSE, fitting};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use glam::DAffine3;
 use serde_json::{Map, Value};
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 
 const FILE: &str = "transforms.json";
@@ -49,7 +49,7 @@ pub(super) fn read_file(folder: &Path, file: &Path, needed: bool) -> Result<Capt
         Frames::read(std::slice::from_ref(&top), folder, Dialect::Transforms)?;
     let mut views: Vec<View> = views.into_iter().flatten().collect();
     if needed {
-        read_splits(&top, &mut views, &left_out)?;
+        assumptions.extend(read_splits(&top, &mut views, &left_out)?);
     }
     let notes = &mut assumptions;
     let scale = unused(top.positive("applied_scale"), notes).unwrap_or(1.0);
@@ -74,11 +74,13 @@ fn list(split: Split) -> String {
     format!("{split}_filenames")
 }
 
-/// Sets the splits of the views; lists may also name frames that were `left_out`.
-fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>) -> Result<()> {
-    let mut named: HashMap<&str, Vec<usize>> = HashMap::new();
+/// Sets the splits of the views; lists may also name frames that were `left_out`. Returns a note on a name that is not
+/// exactly that of a frame.
+fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>) -> Result<Option<String>> {
+    let mut named: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
     views.iter().enumerate().for_each(|(i, view)| named.entry(&view.name).or_default().push(i));
     let mut splits: Vec<Option<Split>> = vec![None; views.len()];
+    let mut notes = vec![];
     for split in Split::ALL {
         let field = list(split);
         let Some(value) = top.get(&field) else { continue };
@@ -86,14 +88,24 @@ fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>)
         for (i, name) in value.as_array().ok_or_else(what)?.iter().enumerate() {
             let field = format!("{field}[{i}]");
             let name = paths::normal(top, &field, name)?;
-            let Some(places) = named.get(name.as_str()) else {
-                if left_out.contains(&name) {
-                    continue;
-                }
-                let what = format!("lists {name}, but no frame has this file_path: remove it; {CHOOSE}");
+            if left_out.contains(&name) {
+                continue;
+            }
+            let names = fitting(named.keys().copied(), &name);
+            let [one] = names[..] else {
+                let what = match names[..] {
+                    [one, two, ..] => {
+                        format!("lists {name}, which fits `{one}` and `{two}`: write more of the path; {CHOOSE}")
+                    }
+                    _ if !fitting(left_out.iter().map(String::as_str), &name).is_empty() => continue,
+                    _ => format!("lists {name}, but no frame has this file_path: remove it; {CHOOSE}"),
+                };
                 return Err(top.error(&field, what));
             };
-            for &place in places {
+            if one != name {
+                notes.push(format!("`{field}` lists {name}, which no frame has: used `{one}`"));
+            }
+            for &place in &named[one] {
                 if split != Split::Train && splits[place] == Some(Split::Train) {
                     let what =
                         format!("lists {name}, which train_filenames has too: remove it from one of them; {CHOOSE}");
@@ -104,7 +116,7 @@ fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>)
         }
     }
     views.iter_mut().zip(splits).for_each(|(view, split)| view.split = split);
-    Ok(())
+    Ok(first_of(&notes))
 }
 
 /// Writes `transforms.json` into `folder`, as nerfstudio reads it, and `sparse_pc.ply` if there are points.

@@ -75,6 +75,14 @@ fn blender_splits_are_all_read() {
     assert_eq!(views, [at(val, "frames[0]"), at(test, "transforms_test.json frames[0]")]);
     file("test", "{}".to_owned()).unwrap();
     says(&failure(read(folder.path()), "transforms_test.json"), &["`frames`: is missing"]);
+    file("test", "{\"frames\": []}".to_owned()).unwrap();
+    let capture = read(folder.path()).unwrap();
+    assert_eq!(
+        (capture.views.len(), &capture.assumptions[..]),
+        (1, &["`transforms_test.json` has no frames".into()][..])
+    );
+    file("val", "{\"frames\": []}".to_owned()).unwrap();
+    says(&failure(read(folder.path()), "transforms_val.json"), &["`frames`: is empty"]);
     let none = tempfile::tempdir().unwrap();
     says(&read(none.path()).unwrap_err().to_string(), &["is not a Blender dataset", "transforms_val.json"]);
 }

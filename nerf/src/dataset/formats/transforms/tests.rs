@@ -237,6 +237,31 @@ fn lists_of_names_are_splits() {
 }
 
 #[test]
+fn lists_name_frames_by_an_end_of_their_path() {
+    let splits = |names: [&str; 2]| {
+        let capture = good(|d| (d["train_filenames"], d["test_filenames"]) = (json!(names), json!(["images/2.png"])));
+        (capture.views.iter().map(|view| view.split).collect::<Vec<_>>(), capture.assumptions)
+    };
+    let expected = vec![Some(Split::Train), Some(Split::Train), Some(Split::Test)];
+    assert_eq!(splits(["images/0.png", "images/1.png"]), (expected.clone(), vec![]));
+    for names in [["0.png", "1.png"], ["0", "images/1"], ["/data/x/images/0.png", "IMAGES/1.JPG"]] {
+        let (found, notes) = splits(names);
+        assert_eq!(found, expected, "{names:?}");
+        let note = format!("`train_filenames[0]` lists {}, which no frame has: used `images/0.png`", names[0]);
+        assert_eq!(notes, [note + ", and 1 more likewise"]);
+    }
+    let list = |name: &'static str| move |d: &mut Value| d["test_filenames"] = json!([name]);
+    for other in ["test/0.png", "10.png", "0.png.png"] {
+        fails(list(other), &["`test_filenames[0]`: lists ", "but no frame has this file_path"]);
+    }
+    let two = |d: &mut Value| {
+        d["frames"][1]["file_path"] = json!("other/0.png");
+        d["test_filenames"] = json!(["0.png"]);
+    };
+    fails(two, &["lists 0.png, which fits `images/0.png` and `other/0.png`: write more of the path"]);
+}
+
+#[test]
 fn applied_transform_includes_its_scale() {
     let applied =
         |fields: Value| good(|d| d.as_object_mut().unwrap().extend(fields.as_object().unwrap().clone())).applied;
