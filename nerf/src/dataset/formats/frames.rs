@@ -1,6 +1,6 @@
 //! The frames of a JSON file as views.
 
-use super::intrinsics::check_known;
+use super::intrinsics::{check_finite, check_known};
 use super::json::{Object, first_of, unused};
 use super::layers::Layers;
 use super::locate::{Located, locate};
@@ -30,7 +30,7 @@ pub(super) enum Dialect {
 pub(super) struct Frames {
     /// The views of each document, in the order of its frames.
     pub(super) views: Vec<Vec<View>>,
-    /// Names of frames without a finite pose, which were left out.
+    /// Names of frames without a usable camera, which were left out.
     pub(super) left_out: HashSet<String>,
     /// The error of the first of them.
     error: Option<Error>,
@@ -72,7 +72,8 @@ impl Frames {
                 return Err(error);
             }
             let (count, total) = (out.left_out.len(), all.len());
-            out.assumptions.push(format!("left out {count} of {total} frames without a finite pose, such as `{name}`"));
+            out.assumptions
+                .push(format!("left out {count} of {total} frames without a usable camera, such as `{name}`"));
         }
         out.assumptions.extend(moving(&all));
         out.assumptions.extend(masks::attach_dynamic(&mut out.views.iter_mut().flatten().collect::<Vec<_>>()));
@@ -94,10 +95,11 @@ impl Frames {
         let first = frames.iter().zip(images).find_map(|(frame, (_, image))| Some((frame, image.as_ref()?)));
         let (mut common, mut unclear, mut contradicting) = (None, BTreeSet::new(), None);
         let mut views = Vec::with_capacity(frames.len());
-        let mut blunt = vec![];
+        let (mut rounded, mut blunt) = (vec![], vec![]);
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
             check_known(frame)?;
-            let pose = match matrix::pose(frame, "transform_matrix")? {
+            let pose = matrix::pose(frame, "transform_matrix")?.and_then(|pose| check_finite(frame).map(|()| pose));
+            let mut pose = match pose {
                 Ok(pose) => pose,
                 Err(error) => {
                     self.error.get_or_insert(error);
@@ -105,6 +107,10 @@ impl Frames {
                     continue;
                 }
             };
+            if matrix::straighten(&mut pose) {
+                let field = frame.field("transform_matrix");
+                rounded.push(format!("`{field}` is a rotation with rounding errors: used the nearest rotation"));
+            }
             let header = || {
                 // An absent image is assumed to be as large as the first.
                 let own = image.as_ref().filter(|_| dialect == Dialect::Transforms).map(|image| (frame, image));
@@ -131,7 +137,7 @@ impl Frames {
                 ..View::new(name, &frame.path, camera)
             });
         }
-        self.assumptions.extend(contradicting.into_iter().chain(first_of(&blunt)));
+        self.assumptions.extend(contradicting.into_iter().chain(first_of(&rounded)).chain(first_of(&blunt)));
         if let Some(first) = unclear.first() {
             let first = first.strip_prefix(folder).unwrap_or(first).display();
             // Of Blender's images, a single header is read.

@@ -98,6 +98,19 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     Err(object.error(name, format!("is {}, which raygrad does not read: {what}", shown(value))))
 }
 
+/// Checks that a frame's own lengths are finite. Those of images without a pose are not, in some files.
+///
+/// # Errors
+/// If one is not finite.
+pub(super) fn check_finite(frame: &Object<'_>) -> Result<()> {
+    for name in ["fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"] {
+        if frame.get(name).and_then(number).is_some_and(|x| !x.is_finite()) {
+            frame.number(name)?;
+        }
+    }
+    Ok(())
+}
+
 impl Layers<'_, '_> {
     /// Reads a side of the image, in pixels. BlenderNeRF writes fractions, which Blender and nerfstudio drop.
     fn side(&self, name: &str) -> Result<Option<usize>> {

@@ -6,6 +6,9 @@ use crate::error::Result;
 use glam::{DAffine3, DMat3, DVec3};
 use serde_json::{Value, json};
 
+/// The largest deviation of `R' R` from the identity for matrices of two decimals.
+const ROUNDED: f64 = 2e-2;
+
 /// Reads an invertible affine transform.
 pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>> {
     let Some(matrix) = object.get(name) else { return Ok(None) };
@@ -17,15 +20,31 @@ pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>
     Ok(Some(transform))
 }
 
-/// Reads a camera-to-world matrix: a rotation and a translation. The inner error is that of a number that is not finite.
+/// Reads a camera-to-world matrix: a rotation, up to [`ROUNDED`], and a translation. The inner error is that of a matrix
+/// that some programs write where they found no pose: none, an empty one, zeros, or numbers that are not finite.
 pub(super) fn pose(object: &Object<'_>, name: &str) -> Result<Result<DAffine3>> {
-    let matrix = object.required(name)?;
-    let pose = transform(matrix).and_then(rigid).map_err(|what| object.error(name, what));
-    let is_infinite = |value: &&Value| number(value).is_some_and(|number| !number.is_finite());
-    match entries(matrix, 4).is_some_and(|entries| entries.iter().any(is_infinite)) {
-        true => Ok(pose),
-        false => pose.map(Ok),
+    let matrix = object.required(name);
+    let is_none = matrix.as_ref().map_or(true, |matrix| entries(matrix, 4).is_some_and(|entries| has_none(&entries)));
+    let pose = matrix.and_then(|matrix| transform(matrix).and_then(rigid).map_err(|what| object.error(name, what)));
+    if is_none { Ok(pose) } else { pose.map(Ok) }
+}
+
+/// Returns true if the entries of a matrix say that there is no pose. JavaScript writes null for NaN.
+fn has_none(entries: &[&Value]) -> bool {
+    let is_lost = |value: &&Value| value.is_null() || number(value).is_some_and(|number| !number.is_finite());
+    entries.iter().any(is_lost) || entries.iter().take(12).all(|value| number(value) == Some(0.0))
+}
+
+/// Replaces a matrix that is no rotation to [`TOLERANCE`] by the nearest rotation; returns whether it did.
+pub(super) fn straighten(pose: &mut DAffine3) -> bool {
+    let is_rounded = !is_orthonormal(&pose.matrix3, TOLERANCE);
+    if is_rounded {
+        // Newton's method for the polar decomposition.
+        for _ in 0..8 {
+            pose.matrix3 = 0.5 * (pose.matrix3 + pose.matrix3.inverse().transpose());
+        }
     }
+    is_rounded
 }
 
 /// The entries of a matrix with this number of columns, row by row: a list of rows or a flat list. `None` for other
@@ -65,7 +84,7 @@ fn transform(matrix: &Value) -> std::result::Result<DAffine3, String> {
     Ok(DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) })
 }
 
-/// Checks that a transform is a rotation and a translation; returns it or an error message.
+/// Checks that a transform is a rotation, up to [`ROUNDED`], and a translation; returns it or an error message.
 fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
     let m = transform.matrix3;
     let scale = (m.x_axis.length() + m.y_axis.length() + m.z_axis.length()) / 3.0;
@@ -76,14 +95,17 @@ fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
              that, and leave the position in the last column as it is"
         ));
     }
-    if m.determinant() < 0.0 && is_orthonormal(&m, TOLERANCE) {
+    if m.determinant() < 0.0 && is_orthonormal(&m, ROUNDED) {
         return Err(
             "the upper left 3x3 mirrors (its determinant is -1): its world or its camera has left-handed axes, \
             as in Unity and Unreal; export right-handed axes"
                 .to_owned(),
         );
     }
-    rotation(&m).map_err(|what| format!("the upper left 3x3 {what}"))?;
+    if !is_orthonormal(&m, ROUNDED) {
+        let more = "write more digits, or a rotation without scale and shear";
+        rotation(&m).map_err(|what| format!("the upper left 3x3 {what}: {more}"))?;
+    }
     Ok(transform)
 }
 

@@ -1,7 +1,8 @@
 use super::*;
 use crate::dataset::capture::Point;
 use crate::dataset::formats::kit::{cases, damage, failure, frames, is_whole, picture, pose, remove, says};
-use glam::DVec3;
+use crate::dataset::formats::rigid;
+use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use raygrad_test_support::skip::skipped;
 use serde_json::json;
@@ -76,21 +77,21 @@ fn invalid_poses_are_named() {
         bad(value, "must be 3 or 4 rows of 4 numbers");
     }
     bad(with(0, 0, 1.01), "not orthonormal");
-    bad(with(0, 1, 0.01), "not orthonormal");
+    bad(with(0, 1, 0.03), "not orthonormal to 1e-3: write more digits, or a rotation without scale and shear");
     bad(with(1, 1, 1e200), "not orthonormal");
     bad(with(2, 2, -1.0), "mirrors");
     bad(with(3, 3, 0.0), "the last row must be 0 0 0 1, is 0 0 0 0");
     bad(with(3, 1, 0.5), "the last row must be 0 0 0 1");
     bad(json!([[2, 0, 0, 0], [0, 0, -2, 0], [0, 2, 0, 4]]), "but scales by 2.000000: divide");
-    bad(json!([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]), "not orthonormal");
-    bad(json!([[1, 0, 0, null], [0, 1, 0, 0], [0, 0, 1, 0]]), "row 0, column 3 is not a finite number: null");
+    bad(json!([[0, 0, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0]]), "not orthonormal");
+    bad(json!([[1, 0, 0, "x"], [0, 1, 0, 0], [0, 0, 1, 0]]), "row 0, column 3 is not a finite number: \"x\"");
     for value in ["NaN", "Infinity", "-Infinity"] {
         let folder = folder(|_| {});
         let text = document().to_string();
         std::fs::write(folder.path().join(FILE), text.replacen("4.0", value, 1)).unwrap();
         let capture = read(folder.path()).unwrap();
         assert_eq!((capture.views.len(), capture.views[0].name.as_str()), (2, "images/1.png"));
-        let expected = "left out 1 of 3 frames without a finite pose, such as `images/0.png`";
+        let expected = "left out 1 of 3 frames without a usable camera, such as `images/0.png`";
         assert_eq!(capture.assumptions, [expected]);
         // Most frames must be whole.
         std::fs::write(folder.path().join(FILE), text.replacen("4.0", value, 2)).unwrap();
@@ -100,7 +101,47 @@ fn invalid_poses_are_named() {
     assert!(
         good(|d| d["frames"][1]["transform_matrix"] = with(0, 1, 1e-4)).views[1].camera.pose.matrix3.y_axis.x == 1e-4
     );
-    fails(|d| remove(&mut d["frames"][1], "transform_matrix"), &["`frames[1].transform_matrix`: is missing"]);
+}
+
+#[test]
+fn frames_without_a_pose_are_left_out() {
+    let expected = "left out 1 of 3 frames without a usable camera, such as `images/1.png`";
+    for value in [json!(null), json!([]), json!(([[0; 4]; 4])), json!(([[(); 4]; 4])), json!(([0; 16]))] {
+        let set = |d: &mut Value| d["frames"][1]["transform_matrix"] = value;
+        let capture = good(set);
+        assert_eq!((capture.views.len(), &capture.assumptions[..]), (2, &[expected.to_owned()][..]));
+    }
+    assert_eq!(good(|d| remove(&mut d["frames"][1], "transform_matrix")).assumptions, [expected]);
+    assert_eq!(good(|d| d["frames"][1]["fl_x"] = json!("NaN")).assumptions, [expected]);
+    // Most frames must have one, and other values are mistakes.
+    let most = |field: &'static str, value: Value| {
+        move |d: &mut Value| (1..3).for_each(|i| d["frames"][i][field] = value.clone())
+    };
+    fails(most("transform_matrix", json!(null)), &["`frames[1].transform_matrix`: is missing"]);
+    fails(most("fl_x", json!("NaN")), &["`frames[1].fl_x`: must be a finite number"]);
+    fails(|d| d["frames"][1]["fl_x"] = json!("wide"), &["`frames[1].fl_x`: must be a finite number"]);
+}
+
+#[test]
+fn rounded_rotations_become_the_nearest() {
+    let exact = DMat3::from_rotation_x(0.3) * DMat3::from_rotation_y(0.7);
+    let with = |digits: f64| {
+        let m = exact.to_cols_array_2d();
+        let row = |r: usize| json!([m[0][r], m[1][r], m[2][r], 1.0]).as_array().unwrap().clone();
+        let rounded = |x: &Value| json!((x.as_f64().unwrap() * digits).round() / digits);
+        let rows: Vec<Vec<Value>> = (0..3).map(|r| row(r).iter().map(rounded).collect()).collect();
+        move |d: &mut Value| (0..2).for_each(|i| d["frames"][i]["transform_matrix"] = json!(rows))
+    };
+    let capture = good(with(100.0));
+    let [pose, other] = [0, 2].map(|i| capture.views[i].camera.pose);
+    assert!(rigid::pose(&pose).is_ok() && pose.matrix3.abs_diff_eq(exact, 0.01));
+    assert!((pose.matrix3.transpose() * pose.matrix3).abs_diff_eq(DMat3::IDENTITY, 1e-12));
+    assert_eq!((pose.translation, other.matrix3), (DVec3::ONE, DMat3::IDENTITY));
+    let note = "`frames[0].transform_matrix` is a rotation with rounding errors: used the nearest rotation, and 1 more \
+                likewise";
+    assert_eq!(capture.assumptions, [note]);
+    assert_eq!(good(with(1e5)).assumptions, [""; 0]);
+    fails(with(10.0), &["`frames[0].transform_matrix`", "not orthonormal", "write more digits"]);
 }
 
 #[test]
