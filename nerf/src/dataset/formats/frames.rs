@@ -10,7 +10,7 @@ use crate::dataset::photo::Photo;
 use crate::error::{Error, Result};
 use serde_json::Value;
 use std::cmp::Ordering;
-use std::collections::{BTreeSet, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 /// The unit of integer depth images in nerfstudio: a millimetre in scenes in metres.
@@ -137,6 +137,7 @@ impl Frames {
                 ..View::new(name, &frame.path, camera)
             });
         }
+        check_distinct(top, &views)?;
         self.assumptions.extend(contradicting.into_iter().chain(first_of(&rounded)).chain(first_of(&blunt)));
         if let Some(first) = unclear.first() {
             let first = first.strip_prefix(folder).unwrap_or(first).display();
@@ -152,6 +153,24 @@ impl Frames {
         }
         Ok(views)
     }
+}
+
+/// Checks that no image of a document has two poses.
+///
+/// # Errors
+/// If one has.
+fn check_distinct(top: &Object<'_>, views: &[View]) -> Result<()> {
+    let mut known: HashMap<&Path, &View> = HashMap::new();
+    for view in views {
+        let image = view.image.as_deref().unwrap_or(Path::new(&view.name));
+        let first = *known.entry(image).or_insert(view);
+        if first.camera.pose != view.camera.pose {
+            let what =
+                format!("has another pose for the image of {}, `{}`: remove one of them", first.field, view.name);
+            return Err(top.error(&view.field, what));
+        }
+    }
+    Ok(())
 }
 
 /// A note on the frames of a scene that moves, as those of D-NeRF.

@@ -145,6 +145,18 @@ fn rounded_rotations_become_the_nearest() {
 }
 
 #[test]
+fn an_image_has_one_pose() {
+    let twice = |z: f64| {
+        move |d: &mut Value| {
+            d["frames"][2] = d["frames"][0].clone();
+            d["frames"][2]["transform_matrix"][2][3] = json!(z);
+        }
+    };
+    assert_eq!(good(twice(4.0)).views.len(), 3);
+    fails(twice(5.0), &["`frames[2]`: has another pose for the image of frames[0], `images/0.png`: remove one"]);
+}
+
+#[test]
 fn fields_that_training_does_not_use_are_ignored_if_they_are_wrong() {
     for (field, value, what) in [
         ("aabb_scale", json!(-4), "must be above 0, is -4"),
