@@ -195,8 +195,25 @@ fn files(
     let name = |frame: &&Object<'_>| frame.get(member).map(|value| paths::normal(frame, member, value)).transpose();
     let names = frames.iter().map(name).collect::<Result<Vec<Option<String>>>>()?;
     let listed: Vec<usize> = (0..frames.len()).filter(|&i| names[i].is_some()).collect();
-    let found = locate(folder, &names.iter().flatten().map(String::as_str).collect::<Vec<_>>(), taken, assumptions);
-    let mut found = found.map_err(|(i, what)| frames[listed[i]].error(member, what))?.into_iter();
+    let paths: Vec<&str> = names.iter().flatten().map(String::as_str).collect();
+    let found = locate(folder, &paths, taken, assumptions);
+    let mut found = found.map_err(|(i, what)| frames[listed[i]].error(member, what))?;
+    let lost = (0..paths.len()).filter(|&i| found[i].is_none());
+    let (lost, plain): (Vec<usize>, Vec<String>) = lost.filter_map(|i| Some((i, paths::plain(paths[i])?))).unzip();
+    if !lost.is_empty() {
+        let taken = found.iter().flatten().map(|file| file.path.clone()).chain(taken.iter().cloned()).collect();
+        let plain: Vec<&str> = plain.iter().map(String::as_str).collect();
+        let others = locate(folder, &plain, &taken, &mut vec![]);
+        let others = others.map_err(|(i, what)| frames[listed[lost[i]]].error(member, what))?;
+        let mut notes = vec![];
+        for (i, file) in lost.into_iter().zip(others).filter_map(|(i, file)| Some((i, file?))) {
+            let inside = file.path.strip_prefix(folder).unwrap_or(&file.path).display();
+            notes.push(format!("`{}` does not exist: used `{inside}`", paths[i]));
+            found[i] = Some(file);
+        }
+        assumptions.extend(first_of(&notes));
+    }
+    let mut found = found.into_iter();
     Ok(names.into_iter().map(|name| Some((name?, found.next().flatten()))).collect())
 }
 

@@ -31,6 +31,21 @@ pub(super) fn normal(object: &Object<'_>, name: &str, value: &Value) -> Result<S
     }
 }
 
+/// A path of a web address or with blanks around it as that of a file: without its query, and with `%20` and the like
+/// decoded. `None` if it is one already.
+pub(super) fn plain(path: &str) -> Option<String> {
+    let (mut bytes, mut rest) = (vec![], path.split('?').next().unwrap_or(path).trim().as_bytes());
+    while let Some((&byte, after)) = rest.split_first() {
+        let code = after.get(..2).filter(|code| byte == b'%' && code.iter().all(u8::is_ascii_hexdigit));
+        let code = code.and_then(|code| u8::from_str_radix(std::str::from_utf8(code).ok()?, 16).ok());
+        bytes.push(code.unwrap_or(byte));
+        rest = if code.is_some() { &after[2..] } else { after };
+    }
+    String::from_utf8(bytes)
+        .ok()
+        .filter(|plain| plain != path && !plain.is_empty() && !plain.contains(char::is_control))
+}
+
 /// A path in Unicode's composed form. macOS decomposes names: it stores `é` as two characters.
 pub(super) fn composed(path: &str) -> String {
     path.nfc().collect()

@@ -157,6 +157,26 @@ fn an_image_has_one_pose() {
 }
 
 #[test]
+fn web_addresses_and_blanks_in_paths_are_read() {
+    let capture = |paths: [&str; 3]| {
+        let folder = folder(|d| (0..3).for_each(|i| d["frames"][i]["file_path"] = json!(paths[i])));
+        std::fs::rename(folder.path().join("images/0.png"), folder.path().join("images/my shot.png")).unwrap();
+        picture(&folder.path().join("images/100%25.png"), 8, 6);
+        let capture = read(folder.path()).unwrap();
+        let name = |view: &View| Some(view.image.as_ref()?.file_name()?.to_str()?.to_owned());
+        (capture.views.iter().map(name).collect::<Vec<_>>(), capture.assumptions)
+    };
+    let found = |names: [&str; 3]| names.map(|name| (!name.is_empty()).then(|| name.to_owned())).to_vec();
+    let (images, notes) = capture(["images/my%20shot.png", "https://host/a/images/1.png?v=1", "images/100%25.png"]);
+    assert_eq!(images, found(["my shot.png", "1.png", "100%25.png"]));
+    let note = "`images/my%20shot.png` does not exist: used `images/my shot.png`, and 1 more likewise";
+    assert_eq!(notes, [note]);
+    // A file of the listed name counts, also in another folder.
+    let (images, notes) = capture(["images/my shot.png ", "C:\\data\\100%25.png", "images/my%20shot2.png"]);
+    assert_eq!((images, notes.len()), (found(["my shot.png", "100%25.png", ""]), 2));
+}
+
+#[test]
 fn fields_that_training_does_not_use_are_ignored_if_they_are_wrong() {
     for (field, value, what) in [
         ("aabb_scale", json!(-4), "must be above 0, is -4"),
