@@ -4,11 +4,13 @@ use super::Entry;
 use crate::{Grads, Op, ShapeError, Tape, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
-/// A function of variables that may be called on any tape. In a box, so that the operation is compiled once for each
-/// scalar type.
+/// A function of variables that may be called on any tape.
+type Function<T> = dyn for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T> + Send + Sync;
+
+/// A function as an operation. It is in a box, so that this is compiled once for each scalar type.
 struct Composed<T: Scalar> {
     name: &'static str,
-    f: Box<dyn for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T> + Send + Sync>,
+    f: Box<Function<T>>,
 }
 
 impl<T: Scalar> Op<T> for Composed<T> {

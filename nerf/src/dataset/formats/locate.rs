@@ -4,7 +4,7 @@
 //! the path takes its place. Letter case, Unicode normal form and the extension of an image may differ. Two folders or
 //! files that fit equally well are an error.
 
-use super::paths::{self, composed, extension, folded};
+use super::paths::{self, any_extension, composed, extension, folded};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::ffi::OsString;
@@ -45,6 +45,12 @@ pub(super) fn locate(
     taken: &HashSet<PathBuf>,
     assumptions: &mut Vec<String>,
 ) -> Result<Vec<Option<Located>>, Ambiguity> {
+    for (i, name) in names.iter().enumerate() {
+        if let [one, two, ..] = &paths::twins(folder, name)[..] {
+            let [one, two] = [one, two].map(|path| shown(path.strip_prefix(folder).unwrap_or(path)));
+            return Err((i, format!("`{name}` has no ending, and `{one}` and `{two}` fit: write the ending")));
+        }
+    }
     let exact = |name: &&str| paths::find(folder, name).map(|path| Located { path, factor: 1 });
     let mut found: Vec<Option<Located>> = names.iter().map(exact).collect();
     let listed: Vec<[&str; 2]> = names.iter().map(|name| split(name)).collect();
@@ -186,9 +192,9 @@ fn other_form(one: &str, two: &str) -> &'static str {
     }
 }
 
-/// A folded file name, without the extension of an image.
+/// A folded file name, without the extension of an image in any format.
 pub(in crate::dataset) fn stem(name: &str) -> String {
-    let ending = extension(name).map_or(0, |ending| ending.len() + 1);
+    let ending = any_extension(name).map_or(0, |ending| ending.len() + 1);
     folded(&name[..name.len() - ending])
 }
 
@@ -227,18 +233,20 @@ impl Directory {
     }
 
     /// The files that fit a name best: of the same name, or else in another Unicode normal form, or else in other
-    /// letter case, or else, if `others` is true, with the extension of another image format.
+    /// letter case, or else, if `others` is true, with the extension of another image format, of those that are decoded
+    /// first.
     fn of(&self, name: &str, others: bool) -> Vec<&OsString> {
         let all = self.files.get(&stem(name)).map_or(&[][..], Vec::as_slice);
         let fits = |test: &dyn Fn(&str) -> bool| -> Vec<&OsString> {
             all.iter().filter(|file| test(&file.to_string_lossy())).collect()
         };
         let is_image = |file: &str| others && extension(file).is_some();
-        let rules: [&dyn Fn(&str) -> bool; 4] = [
+        let rules: [&dyn Fn(&str) -> bool; 5] = [
             &|file| file == name,
             &|file| composed(file) == composed(name),
             &|file| folded(file) == folded(name),
             &is_image,
+            &|file| others && any_extension(file).is_some(),
         ];
         rules.into_iter().map(fits).find(|files| !files.is_empty()).unwrap_or_default()
     }

@@ -9,6 +9,10 @@ use unicode_normalization::UnicodeNormalization;
 /// Extensions of image files, tried in this order if a name has none.
 const EXTENSIONS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 
+/// Extensions of images that other programs list or that stand beside others: converted before, or not decoded here.
+const OTHERS: [&str; 14] =
+    ["heic", "heif", "avif", "jfif", "jpe", "tif", "tiff", "bmp", "gif", "dng", "arw", "cr2", "nef", "exr"];
+
 /// The longest path, in bytes. Operating systems allow a few times as many at most.
 const LONGEST: usize = 1024;
 
@@ -56,10 +60,29 @@ pub(super) fn folded(path: &str) -> String {
     composed(&path.to_lowercase())
 }
 
+/// The extension of a path if it is one of these.
+fn one_of(path: &str, mut known: impl Iterator<Item = &'static &'static str>) -> Option<&str> {
+    let (stem, given) = path.rsplit_once('.')?;
+    (!stem.is_empty() && known.any(|known| known.eq_ignore_ascii_case(given))).then_some(given)
+}
+
 /// The extension of a path if it is that of an image file.
 pub(super) fn extension(path: &str) -> Option<&str> {
-    let (stem, given) = path.rsplit_once('.')?;
-    (!stem.is_empty() && EXTENSIONS.iter().any(|known| known.eq_ignore_ascii_case(given))).then_some(given)
+    one_of(path, EXTENSIONS.iter())
+}
+
+/// The extension of a path if it is that of an image in any format.
+pub(super) fn any_extension(path: &str) -> Option<&str> {
+    one_of(path, EXTENSIONS.iter().chain(&OTHERS))
+}
+
+/// The files of different extensions that fit a path without one.
+pub(super) fn twins(folder: &Path, path: &str) -> Vec<PathBuf> {
+    let fits = |extension: &&str| find(folder, &format!("{path}.{extension}"));
+    if any_extension(path).is_some() || folder.join(path).is_file() {
+        return vec![];
+    }
+    EXTENSIONS.iter().filter_map(fits).collect()
 }
 
 /// Finds a file below `folder`: by its path, with an extension appended, or with its extension in the other case.

@@ -218,3 +218,25 @@ fn names_that_are_not_utf8_and_links_are_found() {
     let located = locate(&folder, &["x/0.png"], &HashSet::new(), &mut vec![]).unwrap();
     assert_eq!(located[0].as_ref().unwrap().path, folder.join("images/0.png"), "found once");
 }
+
+#[test]
+fn images_of_phones_are_found_after_their_conversion() {
+    for listed in ["images/0.HEIC", "images/0.tif", "C:/dcim/0.dng", "images/0.avif"] {
+        finds(&["images/0.jpg"], &[listed], &["images/0.jpg"]);
+    }
+    // What cannot be decoded is found too, for an error with the remedy; but what can be comes first.
+    finds(&["images/0.HEIC"], &["images/0.jpg"], &["images/0.HEIC"]);
+    finds(&["images/0.HEIC", "images/0.png"], &["images/0.jpg"], &["images/0.png"]);
+    refuses(&["images/0.heic", "images/0.tif"], &["images/0.jpg"], &["`images/0.heic` and `images/0.tif` fit"]);
+    finds(&["images/0.jpg.bak", "images/0.mov"], &["images/0.heic"], &[""]);
+}
+
+#[test]
+fn names_without_ending_fit_one_format() {
+    let (paths, _) = found(&["images/0.jpg", "images/1.PNG"], &["images/0", "images/1"]).unwrap();
+    assert_eq!(paths, [Some("images/0.jpg".to_owned()), Some("images/1.PNG".to_owned())]);
+    let expected = "`images/0` has no ending, and `images/0.png` and `images/0.jpg` fit: write the ending";
+    refuses(&["images/0.jpg", "images/0.png"], &["images/0"], &[expected]);
+    finds(&["images/0.jpg", "images/0.png"], &["images/0.jpg"], &["images/0.jpg"]);
+    finds(&["images/0", "images/0.jpg", "images/0.png"], &["images/0"], &["images/0"]);
+}
