@@ -3,9 +3,9 @@
 use crate::cases::INF;
 use crate::error::ensure;
 use crate::slopes::{checked, product_over, scaled_difference, softplus_slope, within};
-use crate::{Cases, Formula, Grads, Op, Operand, ShapeError, Var, Vjp};
+use crate::{Axes, Cases, Formula, Grads, Op, Operand, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
-use raygrad_tensor::{Indices, Pool, Real, Scalar, Shape, Tensor};
+use raygrad_tensor::{Indices, Mask, Pool, Real, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
 /// y = (a - b)^2; da = 2 g (a - b), db = -da.
@@ -196,15 +196,22 @@ impl<T: Scalar> Op<T> for CrossEntropy {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (x, g) = (cx.x(0), cx.g().value().as_slice());
-        let mut out = cx.pool().tensor(x.shape());
+        let x = cx.x(0);
         let n = x.shape()[x.shape().len() - 1];
+        if cx.recording() {
+            // The gradient at the class is minus the sum of the others: the probability minus 1 would cancel.
+            let is_class = (0..x.value().len()).map(|i| self.classes[i / n] as usize == i % n);
+            let is_class = Mask::new(x.shape(), is_class.collect::<Vec<_>>());
+            let mut column = Shape::from_slice(cx.g().shape());
+            column.push(1);
+            // In two factors, since a probability may underflow that the gradient brings back into range.
+            let root = (x.constant(f64::NEG_INFINITY).where_(&is_class, x.log_softmax(-1)) * 0.5).exp();
+            let others = &root * cx.g().reshape(&column) * &root;
+            return Grads::one((-others.sum_over(Axes::from(-1).keepdims())).where_(&is_class, others));
+        }
+        let (g, mut out) = (cx.g().value().as_slice(), cx.pool().tensor(x.shape()));
         cross_entropy_rows_grad(x.value().as_slice(), n, &self.classes, g, out.as_mut_slice(), cx.pool());
         Grads::one(cx.constant(out))
-    }
-
-    fn is_fused(&self) -> bool {
-        true
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {

@@ -473,6 +473,8 @@ fn lifted_probabilities<T: Scalar>(row: &[f64], lift: f64, offset: f64, class: u
     // In two factors: neither underflows in f64.
     let exact = |i: usize| (0.5 * logits[i]).exp() * g * (0.5 * logits[i]).exp() / total;
     let others: f64 = (0..n).filter(|&i| i != class).map(exact).sum();
+    let sizes: f64 = (0..n).filter(|&i| i != class).map(|i| exact(i) * logits[i].abs()).sum();
+    let size_of_others = if others == 0.0 { 0.0 } else { sizes / others };
     let tape = Tape::<T>::new();
     let x = tape.leaf(Tensor::from_fn(&[1, n], |i| T::from_f64(logits[i] + offset)));
     let first = |value: f64| tape.constant(Tensor::from_fn(&[1, n], |i| T::from_f64(if i == 0 { value } else { 0.0 })));
@@ -487,14 +489,15 @@ fn lifted_probabilities<T: Scalar>(row: &[f64], lift: f64, offset: f64, class: u
         {
             for (i, got) in grad.as_slice().iter().enumerate() {
                 let is_class = name == "cross_entropy" && i == class;
-                if name == "log_softmax" && i == 0 || is_class && recorded == 1 {
+                if name == "log_softmax" && i == 0 {
                     // 1 minus a probability.
                     continue;
                 }
                 let expected = if is_class { -others } else { sign * exact(i) };
                 // The logarithm of the total is rounded in y, and e^x takes that on.
                 let is_rounded = name == "log_softmax" || recorded == 1;
-                let units = if is_rounded { 16.0 + 4.0 * (logits[i].abs() + total.ln()) } else { 16.0 };
+                let size = if is_class { size_of_others } else { logits[i].abs() };
+                let units = if is_rounded { 16.0 + 4.0 * (size + total.ln()) } else { 16.0 };
                 check(&format!("gradient {i} of {name} at {}", logits[i]), *got, Double(expected, 0.0), 0, units)?;
             }
         }
@@ -650,6 +653,30 @@ fn means_at_the_end_of_the_range() {
     }
     check(f32::MAX);
     check(f64::MAX);
+}
+
+/// The gradient at the class is minus the sum of the other probabilities, and 1 minus a probability has no digits left.
+#[test]
+fn gradients_of_confident_predictions() {
+    fn check<T: Scalar>() {
+        for logit in [2.0, 10.0, 16.25, 20.0, 40.0] {
+            let tape = Tape::<T>::new();
+            let x = tape.leaf(Tensor::from([[T::from_f64(logit), T::ZERO]]));
+            let y = x.cross_entropy([0]);
+            let (p, q) = ((-logit).exp() / (1.0 + (-logit).exp()), 1.0 / (1.0 + (-logit).exp()));
+            let recorded = y.grad_graph(&[&x]).remove(0);
+            let plain = y.grad(&[&x]).remove(0);
+            let second = recorded.slice_axis(1, ..1).sum().grad(&[&x]).remove(0);
+            for (got, expected) in [(&plain, [-p, p]), (recorded.value(), [-p, p]), (&second, [p * q, -p * q])] {
+                for (got, expected) in got.as_slice().iter().zip(expected) {
+                    let error = (got.to_f64() / expected - 1.0).abs() / T::EPSILON;
+                    assert!(error <= 8.0 + 2.0 * logit, "{logit} in {}: {got:?} for {expected:e}", T::NAME);
+                }
+            }
+        }
+    }
+    check::<f32>();
+    check::<f64>();
 }
 
 /// The gradient of a function of one row, for an incoming gradient in every element.
