@@ -3,7 +3,8 @@
 use super::pick::{Method, PIXELS, Pick, Places, Put};
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::parallel::chunks;
-use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor, Windows};
+use raygrad_tensor::scale::powers;
+use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor, Windows, map};
 use serde::{Deserialize, Serialize};
 
 /// Kernel, stride and padding of a 2-D pooling, by axis: `[rows, columns]`.
@@ -102,6 +103,30 @@ fn planes<T: Scalar>(
     out
 }
 
+/// `means(x, size)`, sums of at most `size` elements of `x` divided by `size`. A sum may overflow where its mean does not.
+fn in_range<T: Scalar>(
+    x: &Tensor<T>,
+    size: usize,
+    pool: &Pool<T>,
+    means: impl Fn(&Tensor<T>, T) -> Tensor<T>,
+) -> Tensor<T> {
+    let size = T::from_f64(size as f64);
+    let quick = means(x, size);
+    if quick.is_finite() {
+        return quick;
+    }
+    // Half the reciprocal of the size, rounded down to a power of two: exact, and no sum of such products overflows.
+    let [down, _] = powers(size + size);
+    let small = means(&x.map(|x| x * down), size * down);
+    // Other means have their digits, which small elements lose.
+    map(
+        [&quick, &small],
+        pool,
+        #[inline(always)]
+        |[mean, small]| if mean.is_finite() { mean } else { small },
+    )
+}
+
 impl MaxPool2d {
     /// The indices of the largest elements in each single-channel image: `[images, windows]`.
     fn index<T: Scalar>(&self, x: &Tensor<T>) -> Indices {
@@ -156,10 +181,12 @@ impl<T: Scalar> Op<T> for AvgPool2d {
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let windows = self.0.accepted(x[0].shape());
-        let size = T::from_f64(windows.kernel_len() as f64);
-        planes(x[0], &with_plane(x[0].shape(), windows.output()), pool, |x, y| {
-            windows.sums(x, y);
-            y.iter_mut().for_each(|y| *y = *y / size);
+        let shape = with_plane(x[0].shape(), windows.output());
+        in_range(x[0], windows.kernel_len(), pool, |x, size| {
+            planes(x, &shape, pool, |x, y| {
+                windows.sums(x, y);
+                y.iter_mut().for_each(|y| *y = *y / size);
+            })
         })
     }
 
@@ -192,11 +219,12 @@ impl<T: Scalar> Op<T> for AvgPool2dInput {
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let shape = with_plane(x[0].shape(), self.image);
         let windows = self.config.accepted(&shape);
-        let size = T::from_f64(windows.kernel_len() as f64);
-        planes(x[0], &shape, pool, |g, x| {
-            x.fill(T::ZERO);
-            windows.spread(g, x);
-            x.iter_mut().for_each(|x| *x = *x / size);
+        in_range(x[0], windows.kernel_len(), pool, |g, size| {
+            planes(g, &shape, pool, |g, x| {
+                x.fill(T::ZERO);
+                windows.spread(g, x);
+                x.iter_mut().for_each(|x| *x = *x / size);
+            })
         })
     }
 

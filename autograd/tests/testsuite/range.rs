@@ -505,6 +505,36 @@ fn lifted_probabilities<T: Scalar>(row: &[f64], lift: f64, offset: f64, class: u
     Ok(())
 }
 
+/// Means of windows, and gradients of such means, are in range wherever they can be represented.
+fn pooled_means<T: Scalar>(row: &[f64], place: f64, kernel: usize, stride: usize) -> Result<(), TestCaseError> {
+    let (row, exponent) = placed::<T>(row, place);
+    let (n, kernel) = (row.len(), 1 + kernel % row.len());
+    let starts: Vec<usize> = (0..=n - kernel).step_by(stride).collect();
+    let size = kernel as f64;
+    let near = |what: &str, got: T, of: &[f64]| {
+        let exact = sum(of.iter().copied()).over(size);
+        let magnitudes = of.iter().map(|x| x.abs()).sum::<f64>() / size;
+        within(what, got, exact, exponent, 16.0 * magnitudes)
+    };
+    let tape = Tape::<T>::new();
+    let config = Pool2dConfig { stride: [1, stride], ..Pool2dConfig::new([1, kernel]) };
+    let image = tape.leaf(tensor::<T>(&row, exponent).reshape(&[1, 1, 1, n]));
+    let means = image.avg_pool2d(&config);
+    for (&mean, &start) in means.value().as_slice().iter().zip(&starts) {
+        near("avg_pool2d", mean, &row[start..start + kernel])?;
+    }
+    let g = tape.leaf(tensor::<T>(&row[..starts.len()], exponent).reshape(means.shape()));
+    let plain = tape.no_grad(|| means.vjp(&g, &[&image])).remove(0);
+    for grads in [plain, means.vjp(&g, &[&image]).remove(0)] {
+        for (i, &grad) in grads.value().as_slice().iter().enumerate() {
+            let met = |k: &usize| (starts[*k]..starts[*k] + kernel).contains(&i);
+            let of: Vec<f64> = (0..starts.len()).filter(met).map(|k| row[k]).collect();
+            near("gradient of avg_pool2d", grad, &of)?;
+        }
+    }
+    Ok(())
+}
+
 /// Cumulative products and their gradients where others are out of range; exact, since the elements are powers of two
 /// but for one, and one product alone has a gradient.
 fn products<T: Scalar>(powers: &[i32], odd: usize, at: usize) -> Result<(), TestCaseError> {
@@ -581,6 +611,12 @@ proptest! {
     }
 
     #[test]
+    fn pooled_means_of_every_binade(row in row(40), place in 0.0..1.0, kernel: usize, stride in 1_usize..4) {
+        pooled_means::<f32>(&row, place, kernel, stride)?;
+        pooled_means::<f64>(&row, place, kernel, stride)?;
+    }
+
+    #[test]
     fn large_gradients_lift_probabilities_that_underflow(
         row in prop::collection::vec(0.0..1.0, 1..40), lift in -1.0..1.0, offset in -4_000_000..4_000_000, class: usize
     ) {
@@ -649,6 +685,26 @@ fn means_at_the_end_of_the_range() {
         assert_eq!((y.item(), z.item(), x.norm_over(Axes::from(0)).item().to_f64()), (T::ZERO, T::ZERO, f64::INFINITY));
         for grad in [y.grad(&[&x]), z.grad(&[&x])] {
             assert_eq!(grad[0], Tensor::zeros(&[3]));
+        }
+    }
+    check(f32::MAX);
+    check(f64::MAX);
+}
+
+/// Means of windows, and of gradients of windows that share a pixel, of numbers whose sum is out of range.
+#[test]
+fn pooled_means_at_the_end_of_the_range() {
+    fn check<T: Scalar>(most: T) {
+        let (tape, part) = (Tape::<T>::new(), |share: f64| T::from_f64(share) * most);
+        let image = tape.leaf(Tensor::full(&[1, 1, 3, 3], most));
+        let y = image.avg_pool2d(&Pool2dConfig { stride: [1, 1], ..Pool2dConfig::new([2, 2]) });
+        assert_eq!(y.value().as_slice(), [most; 4]);
+        let g = tape.constant(y.value().clone());
+        let [corner, edge] = [0.25, 0.5].map(part);
+        let expected = [corner, edge, corner, edge, most, edge, corner, edge, corner];
+        let plain = tape.no_grad(|| y.vjp(&g, &[&image])).remove(0);
+        for grad in [plain, y.vjp(&g, &[&image]).remove(0)] {
+            assert_eq!(grad.value().as_slice(), expected);
         }
     }
     check(f32::MAX);
