@@ -88,12 +88,53 @@ pub(super) fn walk_rows<S: Copy>(
     }
 }
 
+/// A sum carried in twice the digits of its numbers: `f64` for f32, and for f64 the sum and its rounding errors.
+pub(super) trait CarriedSum: Copy + Default {
+    fn plus(self, x: f64) -> Self;
+    fn value(self) -> f64;
+}
+
+impl CarriedSum for f64 {
+    #[inline(always)]
+    fn plus(self, x: f64) -> Self {
+        self + x
+    }
+    #[inline(always)]
+    fn value(self) -> f64 {
+        self
+    }
+}
+
+impl CarriedSum for [f64; 2] {
+    #[inline(always)]
+    fn plus(self, x: f64) -> Self {
+        let [sum, rest] = self;
+        let next = sum + x;
+        let of_x = next - sum;
+        [next, rest + ((sum - (next - of_x)) + (x - of_x))]
+    }
+    #[inline(always)]
+    fn value(self) -> f64 {
+        let [sum, rest] = self;
+        if sum.is_finite() { sum + rest } else { sum }
+    }
+}
+
 /// y = the sum of x up to and including each entry, in twice the digits of f32 or f64; dx = the sum of g the other way.
 #[derive(Clone, Copy)]
 pub struct Cumsum(
     /// The order.
     pub Walk,
 );
+
+impl Cumsum {
+    fn sums<S: CarriedSum, T: Scalar>(&self, shape: &[usize], x: &[T], y: &mut [T]) {
+        self.0.run(shape, S::default(), |sum, i| {
+            *sum = sum.plus(x[i].to_f64());
+            y[i] = T::from_f64(sum.value());
+        });
+    }
+}
 
 impl<T: Scalar> Op<T> for Cumsum {
     fn name(&self) -> &'static str {
@@ -108,21 +149,10 @@ impl<T: Scalar> Op<T> for Cumsum {
         let mut out = pool.tensor(x[0].shape());
         let (x, y, shape) = (x[0].as_slice(), out.as_mut_slice(), x[0].shape());
         if T::EPSILON > 1e-10 {
-            // f64 is wide enough for sums of f32.
-            self.0.run(shape, 0.0, |sum, i| {
-                *sum += x[i].to_f64();
-                y[i] = T::from_f64(*sum);
-            });
-            return out;
+            self.sums::<f64, T>(shape, x, y)
+        } else {
+            self.sums::<[f64; 2], T>(shape, x, y)
         }
-        self.0.run(shape, [0.0; 2], |state, i| {
-            let ([sum, rest], x) = (*state, x[i].to_f64());
-            let next = sum + x;
-            // What rounding takes from the sum is carried too.
-            let of_x = next - sum;
-            *state = [next, rest + ((sum - (next - of_x)) + (x - of_x))];
-            y[i] = T::from_f64(if next.is_finite() { next + state[1] } else { next });
-        });
         out
     }
 

@@ -2,7 +2,7 @@
 //! their second derivatives.
 
 use proptest::prelude::*;
-use raygrad_autograd::{Axes, Pool2dConfig, Scalar, Tape, Tensor, Var};
+use raygrad_autograd::{Axes, Pool2dConfig, Scalar, Segments, Tape, Tensor, Var};
 use std::ops::{Add, Mul, Sub};
 
 /// A sum of two f64 that do not overlap: about 106 bits.
@@ -535,6 +535,44 @@ fn pooled_means<T: Scalar>(row: &[f64], place: f64, kernel: usize, stride: usize
     Ok(())
 }
 
+/// Cumulative sums along an axis and in segments, and their gradients, which run the other way, are rounded once. Before
+/// that, sums of f32 have the precision of f64, and sums of f64 its square.
+fn cumulative_sums<T: Scalar>(row: &[f64], repeats: usize, place: f64) -> Result<(), TestCaseError> {
+    let (row, exponent) = placed::<T>(row, 0.9 * place);
+    let row: Vec<f64> = row.iter().cycle().take(row.len() * repeats).copied().collect();
+    let n = row.len();
+    let backwards: Vec<f64> = row.iter().rev().copied().collect();
+    let precision = if T::NAME == "f32" { f64::EPSILON } else { f64::EPSILON * f64::EPSILON };
+    let tape = Tape::<T>::new();
+    let x = tape.leaf(tensor::<T>(&row, exponent));
+    let segments = Segments::uniform(1, n);
+    let check = |what: &str, got: &[T], row: &[f64], skip: usize| -> Result<(), TestCaseError> {
+        let (mut exact, mut magnitudes) = (Double(0.0, 0.0), 0.0);
+        for (k, &got) in got.iter().enumerate() {
+            if k >= skip {
+                exact = exact + Double(row[k - skip], 0.0);
+                magnitudes += row[k - skip].abs();
+            }
+            let units = 0.501 * exact.0.abs() + n as f64 * precision / T::EPSILON * magnitudes;
+            within(what, got, exact, exponent, units)?;
+        }
+        Ok(())
+    };
+    for (what, y, skip) in [
+        ("cumsum", x.cumsum(0), 0),
+        ("segment_cumsum", x.segment_cumsum(&segments, false), 0),
+        ("exclusive segment_cumsum", x.segment_cumsum(&segments, true), 1),
+    ] {
+        check(what, y.value().as_slice(), &row, skip)?;
+        let plain = tape.no_grad(|| y.vjp(&x, &[&x])).remove(0);
+        for grad in [plain, y.vjp(&x, &[&x]).remove(0)] {
+            let grad: Vec<T> = grad.value().as_slice().iter().rev().copied().collect();
+            check(&format!("gradient of {what}"), &grad, &backwards, skip)?;
+        }
+    }
+    Ok(())
+}
+
 /// Cumulative products and their gradients where others are out of range; exact, since the elements are powers of two
 /// but for one, and one product alone has a gradient.
 fn products<T: Scalar>(powers: &[i32], odd: usize, at: usize) -> Result<(), TestCaseError> {
@@ -614,6 +652,12 @@ proptest! {
     fn pooled_means_of_every_binade(row in row(40), place in 0.0..1.0, kernel: usize, stride in 1_usize..4) {
         pooled_means::<f32>(&row, place, kernel, stride)?;
         pooled_means::<f64>(&row, place, kernel, stride)?;
+    }
+
+    #[test]
+    fn cumulative_sums_are_rounded_once(row in row(40), repeats in 1_usize..60, place in 0.0..1.0) {
+        cumulative_sums::<f32>(&row, repeats, place)?;
+        cumulative_sums::<f64>(&row, repeats, place)?;
     }
 
     #[test]
