@@ -122,4 +122,12 @@
 //! | `tanh(x)` | `inf` | `1` | `0` | |
 //! | `erf(x)` | `-inf` | `-1` | `0` | |
 //! | `huber(a, b, 2)` | `inf; 0` | `inf` | `2; -2` | |
+//! | `pow(a, b)` | `0.5; inf` | `0` | `0; 0` | the power vanishes faster than its exponent grows |
+//! | `pow(a, b)` | `2; -inf` | `0` | `0; 0` | |
+//! | `pow(a, b)` | `0; inf` | `0` | `0; 0` | |
+//! | `pow(a, b)` | `inf; -0.5` | `0` | `0; 0` | |
+//! | `pow(a, b)` | `inf; -inf` | `0` | `0; 0` | |
+//! | `pow(a, b)` | `-inf; -inf` | `0` | `0; NaN` | |
+//! | `powf(x, inf)` | `0.5` | `0` | `0` | |
+//! | `powf(x, -inf)` | `2` | `0` | `0` | |
 //! | `binary_cross_entropy_with_logits(a, b)` | `1000; 0` | `1000` | `1; -1000` | |

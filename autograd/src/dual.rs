@@ -300,7 +300,7 @@ impl<E: Real, const N: usize> Real for Dual<E, N> {
             exponent,
             y,
             #[inline(always)]
-            |s| base_slope(s, a, b, y),
+            |s| base_slope(s, a, factor_of(y, b), y),
             #[inline(always)]
             |t| exponent_slope(t, a, b, y),
         )

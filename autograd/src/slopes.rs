@@ -324,7 +324,14 @@ pub(crate) fn any_powi_slope<E: Real>(s: E, x: E, n: i32) -> E {
     )
 }
 
-/// The derivative of y = a^b by a.
+/// The factor of a power in a derivative. An infinite factor of a power that is 0 becomes 0: the power vanishes faster.
+#[inline(always)]
+pub(crate) fn factor_of<E: Real>(power: E, factor: E) -> E {
+    let limit = power.abs().if_positive(factor, factor.like(0.0));
+    (factor.abs() - factor.like(1e30)).if_positive(limit, factor)
+}
+
+/// The derivative of y = a^b by a. An exponent that may be infinite has to be a [`factor_of`] y.
 #[inline(always)]
 pub(crate) fn base_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let (zero, one) = (a.like(0.0), a.like(1.0));
@@ -356,10 +363,10 @@ pub(crate) fn base_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
 pub(crate) fn exponent_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
     let (zero, one, size) = (a.like(0.0), a.like(1.0), a.abs());
     // Logarithms that are finite where they are not chosen, or the next derivative would be NaN.
-    let ln = size.if_positive(a, one).ln();
+    let ln = factor_of(y, size.if_positive(a, one).ln());
     let factors = [size.if_positive(y, one), size.if_positive(y * ln, one)];
     let full = checked!(s * (y * ln), one + one, [], factors, (s.wide() * E::Wide::pow(a, b, y) * ln.wide()).narrow());
-    let ln_of_size = (-b).if_positive(size, one).ln();
+    let ln_of_size = size.if_positive(one, (-b).if_positive(size, one)).ln();
     let at_zero = s * (-b).if_positive(y * ln_of_size, y * zero + a * zero);
     size.if_positive(full, at_zero)
 }

@@ -1,7 +1,7 @@
 //! Powers, reciprocals, and x ln y.
 
 use crate::cases::{INF, NAN};
-use crate::slopes::{any_powi_slope, base_slope, exponent_slope, powi_slope, product_over};
+use crate::slopes::{any_powi_slope, base_slope, exponent_slope, factor_of, powi_slope, product_over};
 use crate::{Cases, Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 
@@ -117,7 +117,7 @@ impl Formula<2> for Pow {
     }
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], y: E) -> [E; 2] {
-        [base_slope(g, a, b, y), exponent_slope(g, a, b, y)]
+        [base_slope(g, a, factor_of(y, b), y), exponent_slope(g, a, b, y)]
     }
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0).domain(-2.0..2.0);
@@ -170,7 +170,12 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// gradient 0.
     #[track_caller]
     pub fn powf(&self, exponent: f64) -> Self {
-        Powf { exponent }.on([self])
+        match exponent {
+            1.0 => self.powi(1),
+            // The exponent may be infinite, and `Powf` has none of those limits.
+            _ if exponent.abs() > 1e30 => self.pow(self.constant(exponent)),
+            _ => Powf { exponent }.on([self]),
+        }
     }
 }
 

@@ -516,7 +516,11 @@ fn limits_at_infinity_and_at_the_ends_of_constants() {
         let tape = Tape::new();
         let [a, b] = [a, b].map(|x| tape.leaf(Tensor::scalar(x)));
         let y = f(&a, &b);
-        [y.item()].into_iter().chain(y.grad(&[&a, &b]).iter().map(Tensor::item)).collect::<Vec<_>>()
+        let (plain, recorded) = (y.grad(&[&a, &b]), y.grad_graph(&[&a, &b]));
+        for (plain, recorded) in plain.iter().zip(recorded) {
+            assert!(plain.item() == recorded.item() || plain.item().is_nan(), "{plain:?}, {recorded:?}");
+        }
+        [y.item()].into_iter().chain(plain.iter().map(Tensor::item)).collect::<Vec<_>>()
     };
     let inf = f64::INFINITY;
     assert_eq!(grads(|a, b| a.atan2(b), 1.0, inf), [0.0; 3]);
@@ -524,6 +528,18 @@ fn limits_at_infinity_and_at_the_ends_of_constants() {
     assert_eq!(grads(|a, b| a.binary_cross_entropy_with_logits(b), inf, 1.0)[..2], [0.0, 0.0]);
     assert_eq!(grads(|a, b| a.binary_cross_entropy_with_logits(b), -inf, 0.0)[..2], [0.0, 0.0]);
     assert!(grads(|a, b| a.binary_cross_entropy_with_logits(b), 1.0, f64::NAN)[0].is_nan());
+    // Powers that have vanished, with an infinite exponent or an infinite base.
+    let mut random = Random::of("pow", 0);
+    for _ in 0..1000 {
+        let x = random.pattern::<f64>().abs();
+        let exponent = if x < 1.0 { inf } else { -inf };
+        if x != 1.0 {
+            assert_eq!(grads(|a, b| a.pow(b), x, exponent), [0.0; 3], "{x:e}");
+        }
+        if x != 0.0 {
+            assert_eq!(grads(|a, b| a.pow(b), inf, -x), [0.0; 3], "{x:e}");
+        }
+    }
     // The exponent -2^31, which has no predecessor.
     assert_eq!(grads(|a, _| a.powi(i32::MIN), -1.0, 0.0)[1], 2.0_f64.powi(31));
     // A parabola of a width that rounds to 0.
