@@ -1,6 +1,7 @@
 //! Formulas on a tape: numbers that stand for variables.
 
-use crate::Var;
+use crate::ops::arithmetic::MulAdd;
+use crate::{Formula, Var};
 use raygrad_tensor::{Plain, Real, Scalar};
 use std::array::from_fn;
 use std::cell::RefCell;
@@ -21,6 +22,7 @@ enum Step<'t, T: Scalar> {
     Binary(fn(&Var<'t, T>, &Var<'t, T>) -> Var<'t, T>, [usize; 2]),
     Powi(i32, usize),
     IfPositive([usize; 3]),
+    MulAdd([usize; 3]),
 }
 
 impl<'t, T: Scalar> Step<'t, T> {
@@ -29,7 +31,7 @@ impl<'t, T: Scalar> Step<'t, T> {
             Step::Given(_) | Step::Constant(_) => &[],
             Step::Unary(_, x) | Step::Powi(_, x) => std::slice::from_ref(x),
             Step::Binary(_, x) => x,
-            Step::IfPositive(x) => x,
+            Step::IfPositive(x) | Step::MulAdd(x) => x,
         }
     }
 }
@@ -79,6 +81,7 @@ impl<'t, T: Scalar> Sheet<'t, T> {
                     Step::Binary(f, [a, b]) => f(&vars[*a], &vars[*b]),
                     Step::Powi(exponent, x) => vars[*x].powi(*exponent),
                     Step::IfPositive([x, yes, no]) => vars[*x].if_positive(&vars[*yes], &vars[*no]),
+                    Step::MulAdd(x) => MulAdd.on(x.map(|x| &vars[x])),
                 });
             }
         });
@@ -173,7 +176,7 @@ impl<T: Scalar> Real for Recorded<'_, '_, T> {
         self.sheet.push(Step::Powi(exponent, self.index))
     }
     fn mul_add(self, factor: Self, summand: Self) -> Self {
-        self * factor + summand
+        self.sheet.push(Step::MulAdd([self.index, factor.index, summand.index]))
     }
     type Wide = Plain<Self>;
     raygrad_tensor::functions!(recorded());

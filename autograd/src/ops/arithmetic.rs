@@ -51,6 +51,23 @@ impl Formula<2> for Mul {
     }
 }
 
+/// y = a b + c, rounded once; the rounding error of a product is one of these.
+#[derive(Clone, Copy)]
+pub struct MulAdd;
+impl Formula<3> for MulAdd {
+    const NAME: &'static str = "mul_add";
+    #[inline(always)]
+    fn f<E: Real>(&self, [a, b, c]: [E; 3]) -> E {
+        a.mul_add(b, c)
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).domain(-3.0..3.0).domain(-3.0..3.0);
+        // (1 + 2^-23)^2 - (1 + 2^-22) in f32, whose rounded product is the second number.
+        let x = 1.0 + 2.0_f64.powi(-23);
+        c.at([x, x, -1.0 - 2.0_f64.powi(-22)], 2.0_f64.powi(-46), [x, x, 1.0]);
+    }
+}
+
 /// y = a / b; da = g / b, db = -g a / b^2. Division by 0 follows IEEE 754.
 #[derive(Clone, Copy)]
 pub struct Div;
@@ -224,5 +241,5 @@ elementwise! {
     /// If the shapes do not broadcast.
     #[doc(alias = "fmod")]
     remainder(divisor) = Remainder;
-    also examined: Add, Sub, Mul, Div, Affine { scale: -2.5, shift: 0.75 }, Alias;
+    also examined: Add, Sub, Mul, Div, MulAdd, Affine { scale: -2.5, shift: 0.75 }, Alias;
 }

@@ -27,8 +27,9 @@ macro_rules! cases {
 }
 
 /// Operations of the catalogue without a reference, and why.
-const WITHOUT: [(&str, &str); 7] = [
+const WITHOUT: [(&str, &str); 8] = [
     ("alias", "the tape's own copy of an input, not callable from outside; it is the identity"),
+    ("mul_add", "the exact sum of a product in recorded gradients, not callable from outside; tests of those cover it"),
     ("ratio", "part of the gradients of norm, var and std, not callable from outside; tests of their range cover it"),
     ("cumprod_grad", "compared as the gradient of cumprod"),
     ("mean", "compared as sum.mean"),
