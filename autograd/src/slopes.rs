@@ -185,11 +185,11 @@ pub(crate) fn sqrt_slope<E: Real>(s: E, y: E) -> E {
     s / (y + y)
 }
 
-/// `sqrt(1 - x^2)`, as a product that keeps its digits near +-1.
+/// `sqrt(1 - x^2)`, with a square that is rounded with the difference and so keeps its digits near +-1.
 #[inline(always)]
 pub(crate) fn complement<E: Real>(x: E) -> E {
     let one = x.like(1.0);
-    let square = (one - x) * (one + x);
+    let square = (-x).mul_add(x, one);
     // At +-1 another zero: the root has an infinite slope there, and its argument the slope 0 in one factor.
     let is_inside = square.abs();
     is_inside.if_positive(is_inside.if_positive(square, one).sqrt(), one - x.abs())

@@ -11,7 +11,7 @@ mod operations;
 mod singles;
 
 use exact::{Exact, scaled};
-use operations::{Operation, Reference, operations};
+use operations::{Operation, Reference, one, operations};
 use raygrad_autograd::{Scalar, Tape, Tensor, Var};
 use rayon::prelude::*;
 use std::sync::LazyLock;
@@ -512,6 +512,38 @@ fn recorded_gradients_are_within_8_units_in_the_last_place() {
     }
     let failed: Vec<_> = check::<f32>().into_iter().chain(check::<f64>()).collect();
     assert!(failed.is_empty(), "beyond {GATE} units in the last place:\n{}", failed.join("\n"));
+}
+
+/// Second derivatives in which the difference of two terms or the square of a bell would lose the digits.
+#[test]
+fn second_derivatives_are_within_8_units_in_the_last_place() {
+    type Row<T> = (for<'t> fn(&Var<'t, T>) -> Var<'t, T>, fn(Exact) -> Exact);
+    fn check<T: Scalar>() {
+        let rows: [Row<T>; 4] = [
+            (|x| x.asin(), |x| x / (one() - x.square()).sqrt() / (one() - x.square())),
+            (|x| x.acos(), |x| -x / (one() - x.square()).sqrt() / (one() - x.square())),
+            (|x| x.erf(), |x| -x.shifted(2) * (-x.square()).exp() / Exact::PI.sqrt()),
+            (|x| x.normal_cdf(), |x| -x * (-x.square().shifted(-1)).exp() / Exact::PI.shifted(1).sqrt()),
+        ];
+        for (k, (f, second)) in rows.into_iter().enumerate() {
+            let end = if k < 2 { 1.0 } else { f64::INFINITY };
+            let (format, mut random) = (Format::of::<T>(), Random::of("second", k as u64));
+            let x: Vec<f64> = (0..4000).map(|_| random.argument::<T>()).filter(|x| x.abs() < end).collect();
+            let tape = Tape::<T>::new();
+            let vars = tape.leaf(Tensor::from_fn(&[x.len()], |i| T::from_f64(x[i])));
+            let got = f(&vars).sum().grad_graph(&[&vars]).remove(0).sum().grad(&[&vars]).remove(0);
+            for (&x, got) in x.iter().zip(got.as_slice()) {
+                let exact = second(Exact::new(x));
+                // Ordinary products: those of a bell that is no normal number have lost digits.
+                if !exact.is_zero() && exact.exponent() > format.least + 8 {
+                    let error = format.error(got.to_f64(), exact, exact);
+                    assert!(error <= GATE, "function {k} of {x:e} in {}: {got:?}, {error} units off", T::NAME);
+                }
+            }
+        }
+    }
+    check::<f32>();
+    check::<f64>();
 }
 
 /// Gradients that are recorded for higher orders are ordinary products, but no worse than that.

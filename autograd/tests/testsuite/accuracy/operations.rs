@@ -43,7 +43,7 @@ fn sum(a: Exact, b: Exact) -> (Exact, Exact) {
 
 const NAN: f64 = f64::NAN;
 
-fn one() -> Exact {
+pub fn one() -> Exact {
     Exact::new(1.0)
 }
 
