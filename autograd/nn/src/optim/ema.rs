@@ -60,8 +60,10 @@ impl<T: Scalar> Ema<T> {
         let t = self.steps as f64;
         let decay = if self.warmup { self.decay.min((1.0 + t) / (10.0 + t)) } else { self.decay };
         self.steps = self.steps.saturating_add(1);
-        let share = T::from_f64(1.0 - decay);
         let pairs = self.average.values_mut().iter_mut().zip(params.values());
+        // Only the smaller share is rounded: two rounded shares do not add up to 1, and that error would grow over steps.
+        let blend = if decay > 0.5 { blend::<T, true> } else { blend::<T, false> };
+        let share = T::from_f64(decay.min(1.0 - decay));
         pairs.map(|(a, x)| blend(a.as_mut_slice(), x.as_slice(), share)).sum()
     }
 
@@ -102,18 +104,18 @@ impl<T: Scalar> Ema<T> {
     }
 }
 
-fn blend<T: Scalar>(a: &mut [T], x: &[T], share: T) -> usize {
+/// The weighted mean of `a` and `x`, where `share` is the weight of `x` if the average is slow, else of `a`.
+fn blend<T: Scalar, const SLOW: bool>(a: &mut [T], x: &[T], share: T) -> usize {
     let n = a.len();
     let x = &x[..n];
-    // From a half on, 1 - share is exact. Below, its rounding would add up over steps.
-    let [keep, lost] = if share < T::from_f64(0.5) { [T::ONE, share] } else { [T::ONE - share, T::ZERO] };
     simd::dispatch(
         #[inline(always)]
         || {
             let mut skipped = 0;
             for i in 0..n {
                 let good = x[i].is_finite();
-                let blended = flushed(keep * a[i] + (share * x[i] - lost * a[i]));
+                let [near, far] = if SLOW { [a[i], x[i]] } else { [x[i], a[i]] };
+                let blended = flushed(near + (share * far - share * near));
                 a[i] = if good { blended } else { a[i] };
                 skipped += usize::from(!good);
             }
