@@ -80,7 +80,9 @@ impl Schedule {
             Schedule::Step { from, factor, every, warmup } => {
                 // A fraction such as 0.3 is some roundings less than three times 0.1.
                 let stairs = (fraction / every * (1.0 + 2.0 * f64::EPSILON)).floor();
-                rise(warmup) * from * factor.powf(stairs)
+                // In two factors, since one may underflow although the rate does not.
+                let half = (0.5 * stairs).floor();
+                rise(warmup) * from * factor.powf(half) * factor.powf(stairs - half)
             }
             Schedule::Exponential { from, to, warmup } => rise(warmup) * from * (to / from).powf(fraction),
             Schedule::Cosine { from, to, warmup } => {

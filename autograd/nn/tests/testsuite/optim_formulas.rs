@@ -611,6 +611,21 @@ fn schedules_keep_their_digits_to_the_ends() {
     assert!(count > 500, "{count}");
 }
 
+/// A stair whose power of the factor is a subnormal number, although the rate is not.
+#[test]
+fn small_stairs_keep_their_digits() {
+    let mut worst = Worst(0.0, "Schedule::Step");
+    for factor in [0.3, 0.51, 0.9, 1e-9] {
+        for power in [-300.0, -310.0, -316.0, -320.0, -323.0] {
+            let stairs = (power / f64::log10(factor)).floor() as u64;
+            let schedule = Schedule::Step { from: 1e30, factor, every: 1.0 / stairs as f64, warmup: 0.0 };
+            let half = stairs / 2;
+            let exact = dd(1e30) * dd(factor).pow(half) * dd(factor).pow(stairs - half);
+            worst.see::<f64>(schedule.lr(1.0), exact, exact.0, 0.0, 4.0, || format!("{factor}^{stairs}"));
+        }
+    }
+}
+
 #[test]
 fn long_schedules_step_where_they_should() {
     let stairs = Schedule::Step { from: 1.0, factor: 0.5, every: 0.25, warmup: 0.0 };
