@@ -753,6 +753,12 @@ fn pooled_means_at_the_end_of_the_range() {
     }
     check(f32::MAX);
     check(f64::MAX);
+    // Small means beside them keep their digits.
+    let tape = Tape::<f32>::new();
+    let image =
+        tape.leaf(Tensor::from([f32::MAX, f32::MAX, f32::from_bits(3), f32::from_bits(5)]).reshape(&[1, 1, 1, 4]));
+    let y = image.avg_pool2d(&Pool2dConfig { stride: [1, 2], ..Pool2dConfig::new([1, 2]) });
+    assert_eq!(y.value().as_slice(), [f32::MAX, f32::from_bits(4)]);
 }
 
 /// The gradient at the class is minus the sum of the other probabilities, and 1 minus a probability has no digits left.

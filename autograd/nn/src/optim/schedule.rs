@@ -79,10 +79,13 @@ impl Schedule {
             Schedule::Linear { from, to, warmup } => rise(warmup) * between([from, to], [1.0 - fraction, fraction]),
             Schedule::Step { from, factor, every, warmup } => {
                 // A fraction such as 0.3 is some roundings less than three times 0.1.
-                let stairs = (fraction / every * (1.0 + 2.0 * f64::EPSILON)).floor();
-                // In two factors, since one may underflow although the rate does not.
-                let half = (0.5 * stairs).floor();
-                rise(warmup) * from * factor.powf(half) * factor.powf(stairs - half)
+                let stairs = (fraction / every * (1.0 + 2.0 * f64::EPSILON)).floor().min(f64::MAX);
+                // A power that underflows, where the rate may not, is two factors.
+                let (power, half) = (factor.powf(stairs), (0.5 * stairs).floor());
+                match power >= f64::MIN_POSITIVE {
+                    true => rise(warmup) * from * power,
+                    false => rise(warmup) * from * factor.powf(half) * factor.powf(stairs - half),
+                }
             }
             Schedule::Exponential { from, to, warmup } => rise(warmup) * from * (to / from).powf(fraction),
             Schedule::Cosine { from, to, warmup } => {

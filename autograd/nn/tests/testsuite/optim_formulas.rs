@@ -624,6 +624,8 @@ fn small_stairs_keep_their_digits() {
             worst.see::<f64>(schedule.lr(1.0), exact, exact.0, 0.0, 4.0, || format!("{factor}^{stairs}"));
         }
     }
+    // As many stairs as no number holds.
+    assert_eq!(Schedule::Step { from: 1.0, factor: 0.5, every: 5e-324, warmup: 0.0 }.lr(1.0), 0.0);
 }
 
 #[test]
