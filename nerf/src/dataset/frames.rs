@@ -19,6 +19,9 @@ use std::str::FromStr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+/// A remedy for wrong splits.
+pub(super) const CHOOSE: &str = "`raygrad train --test` chooses other test images";
+
 /// The split of a dataset: training, validation or test.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

@@ -1,7 +1,7 @@
 //! The choice of images that are held out for evaluation.
 
 use super::capture::{Capture, View};
-use super::formats::stem;
+use super::formats::fitting;
 use super::frames::Split;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -9,9 +9,6 @@ use std::collections::HashSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
-
-/// A remedy for wrong splits.
-pub(super) const CHOOSE: &str = "`raygrad train --test` chooses other test images";
 
 /// The images that are held out as [test](Split::Test) images; all others are trained on.
 ///
@@ -143,25 +140,6 @@ fn image(view: &View) -> &Path {
 /// Test if an image is held out, or else training.
 pub(super) fn split_of(view: &View, held_out: &HashSet<PathBuf>) -> Split {
     if held_out.contains(image(view)) { Split::Test } else { Split::Train }
-}
-
-/// The paths that fit a name best: the name itself, or else paths that end in it, or else those without their extension,
-/// or else paths that it ends in, or else any of these in another case or with another extension of images.
-pub(super) fn fitting<'a>(paths: impl Iterator<Item = &'a str> + Clone, name: &str) -> Vec<&'a str> {
-    let is_end =
-        |path: &str, end: &str| path.strip_suffix(end).is_some_and(|rest| rest.is_empty() || rest.ends_with('/'));
-    let rules: [&dyn Fn(&str) -> bool; 5] = [
-        &|path| path == name,
-        &|path| is_end(path, name),
-        &|path| path.rsplit_once('.').is_some_and(|(stem, _)| is_end(stem, name)),
-        &|path| is_end(name, path),
-        &|path| {
-            let [path, name] = [path, name].map(stem);
-            is_end(&path, &name) || is_end(&name, &path)
-        },
-    ];
-    let of = |rule: &dyn Fn(&str) -> bool| -> Vec<&'a str> { paths.clone().filter(|path| rule(path)).collect() };
-    rules.into_iter().map(of).find(|paths| !paths.is_empty()).unwrap_or_default()
 }
 
 /// The first view of each image.

@@ -3,8 +3,8 @@
 use super::capture::{Capture, Format, View};
 use super::depth::{Depths, distances};
 use super::formats;
-use super::frames::{Dataset, Frame, Split, evenly_spaced};
-use super::hold_out::{CHOOSE, split_of};
+use super::frames::{CHOOSE, Dataset, Frame, Split, evenly_spaced};
+use super::hold_out::split_of;
 use super::lens_mask::seen_pixels;
 use super::mask::Mask;
 use super::photo::{Header, Photo};
@@ -440,20 +440,15 @@ impl View {
     /// The brightest value counts as white, in any channel; transparent pixels are black.
     ///
     /// # Errors
-    /// As [`Photo::open`], or if no value is close to white and several are not black.
+    /// As [`Photo::open`], or if there are several values or colours besides black, and no white.
     pub fn mask_photo(&self, size: Option<[usize; 2]>) -> Result<Option<Photo>> {
         let Some(path) = &self.mask else { return Ok(None) };
         let mask = Photo::open(path, size)?;
         if self.mask_is_dynamic {
             return Ok(Some(mask.inverted()));
         }
-        let mask = mask.into_mask().map_err(|most| {
-            let most = 255.0 * most;
-            let what =
-                format!("is brightest at {most:.1} of 255, with other values: write 255 (white) for pixels to use");
-            Error::file(path, what)
-        });
-        mask.map(Some)
+        let what = "has no white, and not one value besides black: write 255 (white) for pixels to use, 0 for others";
+        mask.into_mask().map(Some).ok_or_else(|| Error::file(path, what))
     }
 
     /// Returns the most bytes of memory while the image, its mask and its depths are decoded; without those whose

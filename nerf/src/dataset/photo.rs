@@ -294,16 +294,14 @@ impl Photo {
     /// Converts a mask to grey values whose brightest is white. Transparent pixels become black. A mask may have one value
     /// besides black, such as the number or the colour of an object.
     ///
-    /// # Errors
-    /// With the brightest value, if it is far from white and not the only one besides black: programs that number objects
-    /// write 1, 2, 3.
-    pub(super) fn into_mask(mut self) -> std::result::Result<Photo, f32> {
-        match &mut self.values {
+    /// `None` if it has several values or colours, and no white: programs that number objects write 1, 2, 3.
+    pub(super) fn into_mask(mut self) -> Option<Photo> {
+        let is_clear = match &mut self.values {
             Values::Bytes(values) => whiten(values, self.channels),
             Values::Words(values) => whiten(values, self.channels),
             Values::Floats(values) => whiten(values, self.channels),
-        }?;
-        Ok(self)
+        };
+        is_clear.then_some(self)
     }
 
     /// Multiplies alpha by the values of a [mask](Self::into_mask) of the same size: its black pixels become transparent.
@@ -329,29 +327,31 @@ fn invert<S: Stored>(values: &mut [S], channels: usize) {
 
 /// The least value of the brightest pixel of a mask with grey values.
 const LEAST_WHITE: f32 = 0.9;
+/// The largest difference of the channels of grey, which JPEG colours a little.
+const GREY: f32 = 0.1;
 
-/// Makes all pixels grey and opaque, and the brightest white; or returns its value, as [`Photo::into_mask`] does.
-fn whiten<S: Stored>(values: &mut [S], channels: usize) -> std::result::Result<(), f32> {
-    let brightness = |pixel: &[S]| {
+/// Makes all pixels grey and opaque, and the brightest white; returns false where [`Photo::into_mask`] has no answer.
+fn whiten<S: Stored>(values: &mut [S], channels: usize) -> bool {
+    let color = |pixel: &[S]| {
         let [red, green, blue, alpha] = rgba(pixel);
-        red.max(green).max(blue) * alpha
+        [red, green, blue].map(|value| value * alpha)
     };
-    let all = || values.chunks_exact(channels).map(brightness);
-    let most = all().fold(0.0, f32::max);
-    let is_binary = all().any(|value| value == 0.0) && all().all(|value| value == 0.0 || value == most);
-    if most < LEAST_WHITE && !is_binary {
-        return Err(most);
+    let brightness = |color: [f32; 3]| color.into_iter().fold(0.0, f32::max);
+    let all = || values.chunks_exact(channels).map(color);
+    let most = all().map(brightness).fold(0.0, f32::max);
+    let first = all().find(|color| brightness(*color) > 0.0);
+    let is_black = |color: [f32; 3]| brightness(color) == 0.0;
+    let is_single = all().any(is_black) && all().all(|color| is_black(color) || Some(color) == first);
+    let is_grey = |color: [f32; 3]| color.into_iter().all(|value| brightness(color) - value <= GREY);
+    if !is_single && (most < LEAST_WHITE || !all().all(is_grey)) {
+        return false;
     }
     for pixel in values.chunks_exact_mut(channels) {
-        let value = brightness(pixel);
-        pixel.fill(S::nearest(f64::from(if value == most && most > 0.0 {
-            1.0
-        } else {
-            value / most.max(LEAST_WHITE)
-        })));
+        let value = brightness(color(pixel));
+        pixel.fill(S::nearest(f64::from(if value == 0.0 { 0.0 } else { value / most })));
         pixel[3..].fill(S::nearest(1.0));
     }
-    Ok(())
+    true
 }
 
 /// RGBA of pixels, with their alpha times another.
@@ -525,7 +525,7 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
     Ok((decoder, size))
 }
 
-/// Returns true for a JPEG file without the marker that ends its pixels: decoders invent the rest.
+/// Returns true for a JPEG file without the marker that ends its pixels: decoders invent what is missing.
 fn is_cut_jpeg(path: &Path) -> Result<bool> {
     let (start, _) = start_of(path)?;
     if !start.starts_with(JPEG) {

@@ -13,6 +13,9 @@ use std::cmp::Ordering;
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
+/// The relative difference of equal poses.
+const SAME_POSE: f64 = 1e-6;
+
 /// The unit of integer depth images in nerfstudio: a millimetre in scenes in metres.
 const DEPTH_UNIT: f64 = 1e-3;
 
@@ -164,7 +167,9 @@ fn check_distinct(top: &Object<'_>, views: &[View]) -> Result<()> {
     for view in views {
         let image = view.image.as_deref().unwrap_or(Path::new(&view.name));
         let first = *known.entry(image).or_insert(view);
-        if first.camera.pose != view.camera.pose {
+        let [one, two] = [first, view].map(|view| view.camera.pose);
+        let is_near = one.translation.distance(two.translation) <= SAME_POSE * one.translation.length();
+        if !(is_near && one.matrix3.abs_diff_eq(two.matrix3, SAME_POSE)) {
             let what =
                 format!("has another pose for the image of {}, `{}`: remove one of them", first.field, view.name);
             return Err(top.error(&view.field, what));

@@ -12,16 +12,10 @@ use serde_json::{Map, Value};
 use std::f64::consts::PI;
 
 /// Unsupported camera fields of instant-ngp and nerfstudio. Ignoring them silently would spoil every image.
-const NOT_READ: [&str; 20] = [
+const NOT_READ: [&str; 14] = [
     "x_fov",
     "y_fov",
     "distortion_params",
-    "dist_coeffs",
-    "dist",
-    "distortion",
-    "distortion_coefficients",
-    "radial_distortion",
-    "tangential_distortion",
     "fisheye_crop_radius",
     "ftheta_p0",
     "ftheta_p1",
@@ -34,6 +28,10 @@ const NOT_READ: [&str; 20] = [
     "transform_matrix_start",
     "transform_matrix_end",
 ];
+
+/// Lists of distortion coefficients in other programs. They count where none are given by name.
+const DISTORTIONS: [&str; 6] =
+    ["dist_coeffs", "dist", "distortion", "distortion_coefficients", "radial_distortion", "tangential_distortion"];
 
 /// Names of an intrinsic matrix (focal lengths on the diagonal, the principal point in the last column), and of a list or
 /// object of fx, fy, cx and cy.
@@ -73,20 +71,17 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
             value => number(value) == Some(0.0),
         }
     }
-    // A number `dist` is a distance.
-    let is_read = |name: &str, value: &Value| nothing(value) || name == "dist" && value.is_number();
-    let named = NOT_READ.into_iter().find_map(|name| Some((name, object.get(name).filter(|x| !is_read(name, x))?)));
+    // A number is a distance, and a text such as "none" no coefficient.
+    let is_list = |value: &Value| value.is_array() || value.is_object();
+    let lists = DISTORTIONS.iter().filter(|name| object.get("k1").is_none() && object.get(name).is_some_and(is_list));
+    let all = NOT_READ.iter().chain(lists);
+    let named = all.copied().find_map(|name| Some((name, object.get(name).filter(|value| !nothing(value))?)));
     let Some((name, value)) = named else { return Ok(()) };
     let what = match name {
         "x_fov" | "y_fov" => "write the field of view in radians as camera_angle_x and camera_angle_y",
         "latlong" | "equirectangular" => "write camera_model EQUIRECTANGULAR for such panoramas",
         "distortion_params" => "write the coefficients by name (k1, k2, p1, p2) with their camera_model",
-        "dist_coeffs"
-        | "dist"
-        | "distortion"
-        | "distortion_coefficients"
-        | "radial_distortion"
-        | "tangential_distortion" => {
+        name if DISTORTIONS.contains(&name) => {
             "write the coefficients by name (k1, k2, p1, p2) with their camera_model; OpenCV lists k1, k2, p1, p2, k3"
         }
         "fisheye_crop_radius" => "write masks of the pixels to use, as mask_path",
@@ -260,6 +255,16 @@ fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Opt
                 );
                 return Err(object.error(length, what));
             }
+            // Lengths of these names may be in millimetres.
+            let is_other = ["fx", "fy"].contains(&others.name) && side > 0;
+            let angle_of = object.get(angle).and_then(number).filter(|_| is_other);
+            if let Some(a) = angle_of.filter(|_| angle_y || angle == "camera_angle_x")
+                && (f - focal_length(side, a)).abs() > DIFFERS * f
+            {
+                let other = object.field(others.name);
+                let what = format!("is {a}, but `{other}` has a focal length of {f} pixels: remove the wrong one");
+                return Err(object.error(angle, what));
+            }
             if !FOCAL.contains(&f) {
                 return Err(object.error(length, format!("must be a focal length in pixels, 1e-3 to 1e9, is {f}")));
             }
@@ -315,7 +320,7 @@ impl OtherNames {
                 continue;
             };
             let m: Option<Vec<f64>> = entries.into_iter().map(|x| number(x).filter(|x| x.is_finite())).collect();
-            let lengths = m.ok_or("must have finite numbers").and_then(|m| lengths(&m));
+            let lengths = m.ok_or("must have finite numbers").and_then(|m| lengths(&m, value.is_object()));
             let lengths = lengths.map_err(|what| object.error(name, format!("{what}, is {}", shown(value))))?;
             return Ok(OtherNames { name, lengths: lengths.map(Some) });
         }
@@ -340,10 +345,12 @@ fn entries_of(value: &Value) -> Option<Vec<&Value>> {
     }
 }
 
-/// fx, fy, cx and cy of their list or of an intrinsic matrix; or an error message.
-fn lengths(m: &[f64]) -> std::result::Result<[f64; 4], &'static str> {
+/// fx, fy, cx and cy of their list, which may be `named`, or of an intrinsic matrix; or an error message.
+fn lengths(m: &[f64], named: bool) -> std::result::Result<[f64; 4], &'static str> {
     if let [fx, fy, cx, cy] = *m {
-        return Ok([fx, fy, cx, cy]);
+        // COLMAP lists a focal length, cx, cy and a coefficient.
+        let is_in_order = (0.67..1.5).contains(&(fx / fy)) && (0.25..4.0).contains(&(cx / cy));
+        return if named || is_in_order { Ok([fx, fy, cx, cy]) } else { Err("must be fx, fy, cx, cy in this order") };
     }
     let columns = if m.len() == 9 { 3 } else { 4 };
     let at = |row: usize, column: usize| m[row * columns + column];

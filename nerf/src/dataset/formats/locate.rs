@@ -6,8 +6,9 @@
 
 use super::paths::{self, any_extension, composed, extension, folded};
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::ffi::OsString;
+use std::fs::{DirEntry, FileType};
 use std::path::{Component, Path, PathBuf};
 
 /// The deepest folder that is searched, and the most entries.
@@ -45,35 +46,19 @@ pub(super) fn locate(
     taken: &HashSet<PathBuf>,
     assumptions: &mut Vec<String>,
 ) -> Result<Vec<Option<Located>>, Ambiguity> {
-    for (i, name) in names.iter().enumerate() {
-        if let [one, two, ..] = &paths::twins(folder, name)[..] {
-            let [one, two] = [one, two].map(|path| shown(path.strip_prefix(folder).unwrap_or(path)));
+    let mut listings: HashMap<&str, Directory> = HashMap::new();
+    for (i, name) in names.iter().enumerate().filter(|(_, name)| any_extension(name).is_none()) {
+        let [place, last] = split(name);
+        let directory = listings.entry(place).or_insert_with(|| Directory::read(folder, Path::new(place)));
+        if let [one, two, ..] = &directory.with_ending(last)[..] {
+            let [one, two] = [one, two].map(|file| directory.inside.join(file).display().to_string());
             return Err((i, format!("`{name}` has no ending, and `{one}` and `{two}` fit: write the ending")));
         }
     }
     let exact = |name: &&str| paths::find(folder, name).map(|path| Located { path, factor: 1 });
     let mut found: Vec<Option<Located>> = names.iter().map(exact).collect();
     let listed: Vec<[&str; 2]> = names.iter().map(|name| split(name)).collect();
-    let existing: BTreeSet<&str> = (0..names.len()).filter(|&i| found[i].is_some()).map(|i| listed[i][0]).collect();
-    let mut tree = None;
-    // A folder with few of its files may be a stale copy.
-    for place in &existing {
-        let all: Vec<usize> = (0..names.len()).filter(|&i| listed[i][0] == *place).collect();
-        if all.iter().filter(|&&i| found[i].is_some()).count() * 2 >= all.len() {
-            continue;
-        }
-        let file = |i: usize| found[i].as_ref().and_then(|file| file.path.file_name()?.to_str());
-        let files: Vec<&str> = all.iter().map(|&i| file(i).unwrap_or(listed[i][1])).collect();
-        let others = tree.get_or_insert_with(|| Tree::new(folder)).others(place);
-        let others = others.filter(|inside| !existing.iter().any(|place| *inside == Path::new(place)));
-        let others = others.map(|inside| folder.join(inside));
-        let Some((other, note)) = fuller(folder, &folder.join(place), others, &files) else { continue };
-        let files = files.iter().map(|file| other.join(file)).collect::<Vec<_>>();
-        for (i, path) in all.into_iter().zip(files) {
-            found[i] = path.is_file().then_some(Located { path, factor: 1 });
-        }
-        assumptions.push(note);
-    }
+    let existing: HashSet<&str> = (0..names.len()).filter(|&i| found[i].is_some()).map(|i| listed[i][0]).collect();
     let mut groups: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
     for i in (0..names.len()).filter(|&i| found[i].is_none()) {
         groups.entry(listed[i][0]).or_default().push(i);
@@ -82,6 +67,7 @@ pub(super) fn locate(
     let exact: HashSet<PathBuf> = found.iter().flatten().map(|file| file.path.clone()).collect();
     let is_free = |path: &PathBuf| !exact.contains(path) && !taken.contains(path);
     let mut owners: HashMap<PathBuf, usize> = HashMap::new();
+    let mut tree = None;
     for (place, group) in groups {
         // Images with another extension, in a folder of which others exist as listed, are others.
         let is_there = existing.contains(place);
@@ -95,11 +81,15 @@ pub(super) fn locate(
         };
         let (mut first, mut count) = (None, 0);
         for i in group {
-            let of = |directory: &'_ Directory| -> Vec<PathBuf> {
-                let files = directory.of(listed[i][1], !is_there).into_iter();
-                files.map(|file| directory.inside.join(file)).filter(|file| is_free(&folder.join(file))).collect()
+            let of = |directory: &'_ Directory| -> Option<(usize, Vec<PathBuf>)> {
+                let (rule, files) = directory.of(listed[i][1], !is_there)?;
+                let files = files.into_iter().map(|file| directory.inside.join(file));
+                Some((rule, files.filter(|file| is_free(&folder.join(file))).collect()))
             };
-            let mut fitting: Vec<PathBuf> = directories.iter().flat_map(|directory| of(directory)).collect();
+            let rated: Vec<(usize, Vec<PathBuf>)> = directories.iter().filter_map(|directory| of(directory)).collect();
+            let best = rated.iter().filter(|(_, files)| !files.is_empty()).map(|(rule, _)| *rule).min();
+            let fitting = rated.into_iter().filter(|(rule, _)| Some(*rule) == best);
+            let mut fitting: Vec<PathBuf> = fitting.flat_map(|(_, files)| files).collect();
             let Some(file) = fitting.pop() else { continue };
             if let Some(other) = fitting.pop() {
                 let [one, two] = [&other, &file].map(|path| path.display().to_string());
@@ -135,7 +125,7 @@ pub(super) const IMAGES: [&str; 4] = ["images", "image", "rgb", "input"];
 
 /// The folders in `root` with these names in any case, in the order of the names; exact names come first.
 pub(super) fn folders(root: &Path, names: &[&str]) -> Vec<PathBuf> {
-    let rated = |entry: std::fs::DirEntry| {
+    let rated = |entry: DirEntry| {
         let name = entry.file_name();
         let place = names.iter().position(|own| name.eq_ignore_ascii_case(own))?;
         entry.path().is_dir().then(|| (place, name != names[place], entry.path()))
@@ -193,9 +183,28 @@ fn other_form(one: &str, two: &str) -> &'static str {
 }
 
 /// A folded file name, without the extension of an image in any format.
-pub(in crate::dataset) fn stem(name: &str) -> String {
+pub(super) fn stem(name: &str) -> String {
     let ending = any_extension(name).map_or(0, |ending| ending.len() + 1);
     folded(&name[..name.len() - ending])
+}
+
+/// The paths that fit a name best: the name itself, or else paths that end in it, or else those without their extension,
+/// or else paths that it ends in, or else any of these in another case or with another extension of images.
+pub(in crate::dataset) fn fitting<'a>(paths: impl Iterator<Item = &'a str> + Clone, name: &str) -> Vec<&'a str> {
+    let is_end =
+        |path: &str, end: &str| path.strip_suffix(end).is_some_and(|rest| rest.is_empty() || rest.ends_with('/'));
+    let rules: [&dyn Fn(&str) -> bool; 5] = [
+        &|path| path == name,
+        &|path| is_end(path, name),
+        &|path| path.rsplit_once('.').is_some_and(|(stem, _)| is_end(stem, name)),
+        &|path| is_end(name, path),
+        &|path| {
+            let [path, name] = [path, name].map(stem);
+            is_end(&path, &name) || is_end(&name, &path)
+        },
+    ];
+    let of = |rule: &dyn Fn(&str) -> bool| -> Vec<&'a str> { paths.clone().filter(|path| rule(path)).collect() };
+    rules.into_iter().map(of).find(|paths| !paths.is_empty()).unwrap_or_default()
 }
 
 /// The files of a folder.
@@ -219,8 +228,8 @@ impl Directory {
     /// Reads a single folder, which counts as empty if it cannot be read.
     fn read(folder: &Path, inside: &Path) -> Self {
         let entries = std::fs::read_dir(folder.join(inside)).into_iter().flatten().flatten().take(MOST_ENTRIES);
-        let mut names: Vec<OsString> = entries.map(|entry| entry.file_name()).filter(|name| !is_hidden(name)).collect();
-        names.retain(|name| folder.join(inside).join(name).is_file());
+        let files = entries.filter(|entry| !is_hidden(&entry.file_name()) && is_file(entry));
+        let mut names: Vec<OsString> = files.map(|entry| entry.file_name()).collect();
         names.sort();
         Directory::new(inside.to_owned(), names)
     }
@@ -232,10 +241,25 @@ impl Directory {
         names
     }
 
-    /// The files that fit a name best: of the same name, or else in another Unicode normal form, or else in other
+    /// The files of a name without an ending: one of each decoded format, unless a file has the name itself.
+    fn with_ending(&self, name: &str) -> Vec<&OsString> {
+        let all = self.files.get(&stem(name)).map_or(&[][..], Vec::as_slice);
+        if all.iter().any(|file| file == name) {
+            return vec![];
+        }
+        let mut endings = HashSet::new();
+        let is_new = |file: &&OsString| {
+            let file = file.to_string_lossy();
+            let ending = extension(&file).filter(|ending| file[..file.len() - ending.len() - 1] == *name);
+            ending.is_some_and(|ending| endings.insert(ending.to_lowercase()))
+        };
+        all.iter().filter(is_new).collect()
+    }
+
+    /// The number of the rule by which files fit a name best, and the files: of the same name, or else in another Unicode normal form, or else in other
     /// letter case, or else, if `others` is true, with the extension of another image format, of those that are decoded
     /// first.
-    fn of(&self, name: &str, others: bool) -> Vec<&OsString> {
+    fn of(&self, name: &str, others: bool) -> Option<(usize, Vec<&OsString>)> {
         let all = self.files.get(&stem(name)).map_or(&[][..], Vec::as_slice);
         let fits = |test: &dyn Fn(&str) -> bool| -> Vec<&OsString> {
             all.iter().filter(|file| test(&file.to_string_lossy())).collect()
@@ -248,8 +272,13 @@ impl Directory {
             &is_image,
             &|file| others && any_extension(file).is_some(),
         ];
-        rules.into_iter().map(fits).find(|files| !files.is_empty()).unwrap_or_default()
+        rules.into_iter().map(fits).enumerate().find(|(_, files)| !files.is_empty())
     }
+}
+
+/// Returns true for a file or a link to one. Only links cost a look at the file.
+fn is_file(entry: &DirEntry) -> bool {
+    entry.file_type().is_ok_and(|kind| kind.is_file() || kind.is_symlink() && entry.path().is_file())
 }
 
 fn is_hidden(name: &std::ffi::OsStr) -> bool {
@@ -302,13 +331,6 @@ impl Tree {
         let most = rated.iter().map(|(rating, _)| *rating).max();
         rated.into_iter().filter(|(rating, _)| Some(*rating) == most).map(|(_, directory)| directory).collect()
     }
-
-    /// The paths of the folders of full size whose kind is that of the listed folder `place`.
-    fn others(&self, place: &str) -> impl Iterator<Item = &Path> {
-        let wanted = wanted(place);
-        let folders = self.directories.iter().map(|directory| directory.inside.as_path());
-        folders.filter(move |inside| factor_of(inside) == 1 && is_of_kind(&parts(inside), &wanted))
-    }
 }
 
 /// The folded parts of a listed folder.
@@ -345,11 +367,13 @@ pub(super) fn walk(folder: &Path, deepest: usize) -> Vec<Directory> {
             if is_hidden(&name) {
                 continue;
             }
-            match here.join(&name) {
-                path if path.is_file() => names.push(name),
-                path if path.is_symlink() && depth < deepest => waiting.push_back((inside.join(name), depth + 1)),
-                path if path.is_dir() && depth < deepest => waiting.push_front((inside.join(name), depth + 1)),
-                _ => {}
+            let is = |test: fn(&FileType) -> bool| entry.file_type().is_ok_and(|kind| test(&kind));
+            if is_file(&entry) {
+                names.push(name);
+            } else if is(FileType::is_symlink) && depth < deepest {
+                waiting.push_back((inside.join(name), depth + 1));
+            } else if is(FileType::is_dir) && depth < deepest {
+                waiting.push_front((inside.join(name), depth + 1));
             }
         }
         names.sort();

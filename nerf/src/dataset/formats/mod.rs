@@ -26,7 +26,7 @@ pub mod rigid;
 pub mod transforms;
 
 pub(super) use description::{is_described, read, read_file};
-pub(super) use locate::{DEEPEST, factor_of, stem};
+pub(super) use locate::{DEEPEST, factor_of, fitting};
 
 #[cfg(test)]
 mod kit;

@@ -76,15 +76,6 @@ pub(super) fn any_extension(path: &str) -> Option<&str> {
     one_of(path, EXTENSIONS.iter().chain(&OTHERS))
 }
 
-/// The files of different extensions that fit a path without one.
-pub(super) fn twins(folder: &Path, path: &str) -> Vec<PathBuf> {
-    let fits = |extension: &&str| find(folder, &format!("{path}.{extension}"));
-    if any_extension(path).is_some() || folder.join(path).is_file() {
-        return vec![];
-    }
-    EXTENSIONS.iter().filter_map(fits).collect()
-}
-
 /// Finds a file below `folder`: by its path, with an extension appended, or with its extension in the other case.
 pub(super) fn find(folder: &Path, path: &str) -> Option<PathBuf> {
     let both = |stem: &str, extension: &str| {

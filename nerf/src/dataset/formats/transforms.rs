@@ -5,17 +5,17 @@
 
 use super::frames::{Dialect, Frames};
 use super::json::{self, Object, first_of, shown, unused};
+use super::locate::{fitting, stem};
 use super::{intrinsics, lens, matrix, paths, ply};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
-use crate::dataset::frames::Split;
-use crate::dataset::hold_out::{CHOOSE, fitting};
+use crate::dataset::frames::{CHOOSE, Split};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use glam::DAffine3;
 use serde_json::{Map, Value};
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 const FILE: &str = "transforms.json";
@@ -79,6 +79,12 @@ fn list(split: Split) -> String {
 fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>) -> Result<Option<String>> {
     let mut named: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
     views.iter().enumerate().for_each(|(i, view)| named.entry(&view.name).or_default().push(i));
+    // All names by the stem of their last part, which those that fit a listed name share.
+    let last = |name: &str| stem(name.rsplit('/').next().unwrap_or_default());
+    let mut stems: HashMap<String, BTreeSet<&str>> = HashMap::new();
+    for name in named.keys().copied().chain(left_out.iter().map(String::as_str)) {
+        stems.entry(last(name)).or_default().insert(name);
+    }
     let mut splits: Vec<Option<Split>> = vec![None; views.len()];
     let mut notes = vec![];
     for split in Split::ALL {
@@ -88,24 +94,22 @@ fn read_splits(top: &Object<'_>, views: &mut [View], left_out: &HashSet<String>)
         for (i, name) in value.as_array().ok_or_else(what)?.iter().enumerate() {
             let field = format!("{field}[{i}]");
             let name = paths::normal(top, &field, name)?;
-            if left_out.contains(&name) {
-                continue;
-            }
-            let names = fitting(named.keys().copied(), &name);
+            let names = stems.get(&last(&name)).map_or(vec![], |names| fitting(names.iter().copied(), &name));
             let [one] = names[..] else {
                 let what = match names[..] {
                     [one, two, ..] => {
                         format!("lists {name}, which fits `{one}` and `{two}`: write more of the path; {CHOOSE}")
                     }
-                    _ if !fitting(left_out.iter().map(String::as_str), &name).is_empty() => continue,
                     _ => format!("lists {name}, but no frame has this file_path: remove it; {CHOOSE}"),
                 };
                 return Err(top.error(&field, what));
             };
+            // Other names are those of frames that were left out.
+            let Some(places) = named.get(one) else { continue };
             if one != name {
                 notes.push(format!("`{field}` lists {name}, which no frame has: used `{one}`"));
             }
-            for &place in &named[one] {
+            for &place in places {
                 if split != Split::Train && splits[place] == Some(Split::Train) {
                     let what =
                         format!("lists {name}, which train_filenames has too: remove it from one of them; {CHOOSE}");

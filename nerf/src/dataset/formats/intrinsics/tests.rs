@@ -499,6 +499,12 @@ fn focal_lengths_under_other_names_are_read() {
     }
     // The usual name counts.
     assert_eq!(cameras(|d| d["fx"] = json!(7)), plain);
+    // COLMAP's order, and millimetres beside a field of view.
+    fails(with(json!({ "K": [100, 31, 25, 0.01] })), &["`K`: must be fx, fy, cx, cy in this order, is [100,"]);
+    let millimetres = json!({ "fx": 50, "fy": 50, "camera_angle_x": 0.2 });
+    fails(with(millimetres), &["`camera_angle_x`: is 0.2, but `fx` has a focal length of 50 pixels: remove"]);
+    let agreeing = json!({ "fx": 50, "fy": 50, "cx": 31, "cy": 25, "camera_angle_x": 2.0 * 0.64_f64.atan() });
+    assert_eq!(cameras(with(agreeing))[0].focal, [50.0; 2]);
     // A projection matrix, units of the side, and values that something else explains.
     let projection = json!([[100, 0, 31, 5], [0, 110, 25, 0], [0, 0, 1, 0]]);
     fails(with(json!({ "K": projection })), &["`K`: must have the rows fx 0 cx"]);

@@ -156,31 +156,6 @@ fn files_of_another_kind_take_no_place() {
 }
 
 #[test]
-fn stale_copies_give_way_to_their_originals() {
-    // Names of files, which are as long as their number.
-    let at = |files: &[(&str, usize)], names: &[&str]| {
-        let (_parent, folder) = scene(&files.iter().map(|(file, _)| *file).collect::<Vec<_>>());
-        files.iter().for_each(|(file, length)| std::fs::write(folder.join(file), vec![0; *length]).unwrap());
-        let mut assumptions = vec![];
-        let located = locate(&folder, names, &HashSet::new(), &mut assumptions).unwrap();
-        let found: Vec<PathBuf> = located.into_iter().flatten().map(|file| file.path).collect();
-        (found.iter().filter(|path| path.starts_with(folder.join("photos"))).count(), found.len(), assumptions)
-    };
-    let names = ["images/1.png", "images/2.png", "images/3.png"];
-    let all = [("photos/1.png", 1), ("photos/2.png", 2), ("photos/3.png", 3)];
-    let with = |others: &[(&'static str, usize)]| [&all, others].concat();
-    let note = "`images` holds 1 of 3 files: used `photos`, which holds 3";
-    assert_eq!(at(&with(&[("images/2.png", 2)]), &names), (3, 3, vec![note.to_owned()]));
-    // Another image of the same name, most images, and images that other entries list.
-    assert_eq!(at(&with(&[("images/2.png", 9)]), &names), (0, 1, vec![]));
-    assert_eq!(at(&with(&[("images/2.png", 2), ("images/3.png", 3)]), &names), (0, 2, vec![]));
-    let two = [&names[..], &["photos/1.png"]].concat();
-    assert_eq!(at(&with(&[("images/2.png", 2)]), &two), (1, 2, vec![]));
-    let masks = [("masks/1.png", 1), ("masks/2.png", 2), ("images/1.png", 1)];
-    assert_eq!(at(&masks, &names), (0, 1, vec![]));
-}
-
-#[test]
 fn downscaled_images_count_after_those_of_full_size() {
     finds(&["images_4/0.png", "photos/0.png"], &["frames/0.png"], &["photos/0.png"]);
     finds(&["images_8/0.png", "images_4/0.png"], &["images/0.jpg"], &["images_4/0.png"]);
@@ -235,8 +210,18 @@ fn images_of_phones_are_found_after_their_conversion() {
 fn names_without_ending_fit_one_format() {
     let (paths, _) = found(&["images/0.jpg", "images/1.PNG"], &["images/0", "images/1"]).unwrap();
     assert_eq!(paths, [Some("images/0.jpg".to_owned()), Some("images/1.PNG".to_owned())]);
-    let expected = "`images/0` has no ending, and `images/0.png` and `images/0.jpg` fit: write the ending";
+    let expected = "`images/0` has no ending, and `images/0.jpg` and `images/0.png` fit: write the ending";
     refuses(&["images/0.jpg", "images/0.png"], &["images/0"], &[expected]);
     finds(&["images/0.jpg", "images/0.png"], &["images/0.jpg"], &["images/0.jpg"]);
     finds(&["images/0", "images/0.jpg", "images/0.png"], &["images/0"], &["images/0"]);
+}
+
+#[test]
+fn listed_paths_count_as_they_stand() {
+    // Most images were deleted.
+    let names = ["images/0.png", "images/1.png", "images/2.png"];
+    finds(&["images/0.png", "backup/0.png", "backup/1.png", "backup/2.png"], &names, &["images/0.png", "", ""]);
+    // Of several folders, that with images that can be decoded.
+    finds(&["jpg/0.jpg", "raw/0.dng"], &["images/0.png"], &["jpg/0.jpg"]);
+    finds(&["heic/0.HEIC", "jpg/0.jpg"], &["images/0.JPG"], &["jpg/0.jpg"]);
 }

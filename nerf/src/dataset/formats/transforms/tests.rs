@@ -137,6 +137,10 @@ fn rounded_rotations_become_the_nearest() {
     assert!(rigid::pose(&pose).is_ok() && pose.matrix3.abs_diff_eq(exact, 0.01));
     assert!((pose.matrix3.transpose() * pose.matrix3).abs_diff_eq(DMat3::IDENTITY, 1e-12));
     assert_eq!((pose.translation, other.matrix3), (DVec3::ONE, DMat3::IDENTITY));
+    // The nearest rotation to a rotation times a symmetric matrix close to 1 is the rotation.
+    let symmetric = DMat3::from_cols_array(&[1.003, 0.002, -0.001, 0.002, 0.998, 0.004, -0.001, 0.004, 1.001]);
+    let mut stretched = DAffine3::from_mat3(exact * symmetric);
+    assert!(matrix::straighten(&mut stretched) && stretched.matrix3.abs_diff_eq(exact, 1e-12));
     let note = "`frames[0].transform_matrix` is a rotation with rounding errors: used the nearest rotation, and 1 more \
                 likewise";
     assert_eq!(capture.assumptions, [note]);
@@ -153,6 +157,7 @@ fn an_image_has_one_pose() {
         }
     };
     assert_eq!(good(twice(4.0)).views.len(), 3);
+    assert_eq!(good(twice(4.0 + 1e-9)).views.len(), 3, "rounded");
     fails(twice(5.0), &["`frames[2]`: has another pose for the image of frames[0], `images/0.png`: remove one"]);
 }
 
@@ -307,6 +312,32 @@ fn lists_of_names_are_splits() {
         d["test_filenames"] = json!(["images/0.png"]);
     };
     fails(twice, &["`test_filenames[0]`: lists images/0.png, which train_filenames has too"]);
+}
+
+#[test]
+fn lists_name_frames_that_were_left_out_beside_others() {
+    let splits = |change: fn(&mut Value)| {
+        let capture = read(folder(change).path()).unwrap();
+        capture.views.iter().map(|view| (view.name.clone(), view.split)).collect::<Vec<_>>()
+    };
+    // A second frame of an image has no pose.
+    let found = splits(|d| {
+        let mut again = d["frames"][1].clone();
+        remove(&mut again, "transform_matrix");
+        d["frames"].as_array_mut().unwrap().push(again);
+        d["test_filenames"] = json!(["images/1.png"]);
+    });
+    assert!(found.contains(&("images/1.png".into(), Some(Split::Test))), "{found:?}");
+    // A name that fits a frame and one that was left out.
+    let change = |name: &'static str| {
+        move |d: &mut Value| {
+            d["frames"][1]["file_path"] = json!("other/0.png");
+            remove(&mut d["frames"][1], "transform_matrix");
+            d["test_filenames"] = json!([name]);
+        }
+    };
+    fails(change("0.png"), &["`test_filenames[0]`: lists 0.png, which fits `images/0.png` and `other/0.png`"]);
+    assert!(good(change("other/0.png")).views.iter().all(|view| view.split.is_none()));
 }
 
 #[test]
