@@ -223,17 +223,13 @@ fn reductions() -> Vec<Entry> {
             .sample_of(zeros(&[2, 5], 2))
             .sample(&[&[2, 0]])
             .sample(&[&[1]]),
-        Entry::new(softmax::Softmax { log: false })
+        Entry::new(softmax::Softmax)
             .sample(&[&[2, 5]])
             .sample(wide)
             .sample(&[&[0, 3]])
             .sample(&[&[2, 0]])
             .sample(&[&[1]]),
-        Entry::new(softmax::Softmax { log: true })
-            .sample(&[&[2, 5]])
-            .sample(wide)
-            .sample(&[&[0, 3]])
-            .sample(&[&[2, 0]]),
+        Entry::new(softmax::LogSoftmax).sample(&[&[2, 5]]).sample(wide).sample(&[&[0, 3]]).sample(&[&[2, 0]]),
         Entry::new(softmax::LogSumExp).sample(&[&[2, 5]]).sample(wide).sample(&[&[0, 3]]).sample(&[&[3]]),
         Entry::new(layer_norm::LayerNorm { eps: 1e-3 })
             .sample(&[&[3, 5], &[5], &[5]])

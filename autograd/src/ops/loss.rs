@@ -1,5 +1,6 @@
 //! Losses between predictions and targets.
 
+use super::softmax::softmax_times;
 use crate::cases::INF;
 use crate::error::ensure;
 use crate::slopes::{checked, product_over, scaled_difference, softplus_slope, within};
@@ -204,9 +205,7 @@ impl<T: Scalar> Op<T> for CrossEntropy {
             let is_class = Mask::new(x.shape(), is_class.collect::<Vec<_>>());
             let mut column = Shape::from_slice(cx.g().shape());
             column.push(1);
-            // In two factors, since a probability may underflow that the gradient brings back into range.
-            let root = (x.constant(f64::NEG_INFINITY).where_(&is_class, x.log_softmax(-1)) * 0.5).exp();
-            let others = &root * cx.g().reshape(&column) * &root;
+            let others = x.constant(0.0).where_(&is_class, softmax_times(&x, &cx.g().reshape(&column)));
             return Grads::one((-others.sum_over(Axes::from(-1).keepdims())).where_(&is_class, others));
         }
         let (g, mut out) = (cx.g().value().as_slice(), cx.pool().tensor(x.shape()));

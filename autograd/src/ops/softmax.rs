@@ -2,7 +2,8 @@
 
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::rows;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+use raygrad_tensor::scale::power_of_two;
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, map};
 
 /// The shape, if it has a last axis, and the extent of that.
 fn last_axis(x: &[usize]) -> Result<(Shape, usize), ShapeError> {
@@ -17,11 +18,30 @@ fn kept_last() -> Axes {
     Axes::from(-1).keepdims()
 }
 
-/// `e^x g`, where the power may underflow if `g` brings it back into range: from the root of the power, for all elements
-/// alike.
-fn power_times<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
-    let root = (x * 0.5).exp();
-    &root * g * &root
+/// `g` times the softmax of `x` along the last axis, recorded. Each power is the square of its root, around `g`, which may
+/// bring it back into range.
+pub(super) fn softmax_times<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
+    if x.value().is_empty() {
+        return x * g;
+    }
+    let tape = x.tape();
+    // The shift cancels, so it is a constant.
+    let greatest = x.value().max_over(kept_last());
+    let half = T::from_f64(0.5);
+    // Of each of two roots, by half of the rounding error.
+    let correct = |[x, greatest]: [T; 2]| half + half * rows::corrected(T::ONE, x, greatest);
+    let correction = tape.constant(map([x.value(), &greatest.broadcast_to(x.shape())], tape.pool(), correct));
+    let root = ((x - tape.constant(greatest)) * 0.5).exp() * correction;
+    &root * (g / root.square().sum_over(kept_last())) * &root
+}
+
+/// `dx(g)`, recorded, for a `dx` that is linear. It is computed in smaller units if a sum of rows of `g` may be out of
+/// range.
+fn in_range<'t, T: Scalar>(g: &Var<'t, T>, dx: impl Fn(&Var<'t, T>) -> Var<'t, T>) -> Var<'t, T> {
+    let n = g.shape()[g.shape().len() - 1].max(1);
+    let up = power_of_two(2 + i64::from(n.ilog2()));
+    let most = if size_of::<T>() == 4 { f32::MAX.into() } else { f64::MAX };
+    if g.value().iter().all(|g| g.to_f64().abs() <= most / up) { dx(g) } else { dx(&(g / up)) * up }
 }
 
 /// A tensor of the shape of `x`, whose rows `kernel(x, row length, out)` writes.
@@ -31,17 +51,13 @@ fn by_rows<T: Scalar>(x: &Tensor<T>, pool: &Pool<T>, kernel: impl FnOnce(&[T], u
     out
 }
 
-/// y = e^(x - max) / sum e^(x - max) along the last axis; dx = y (g - sum g y). The logarithm of it is
-/// y = x - max - ln sum e^(x - max), with dx = g - e^y sum g.
+/// y = e^(x - max) / sum e^(x - max) along the last axis; dx = y (g - sum g y).
 #[derive(Clone, Copy)]
-pub struct Softmax {
-    /// Whether to take the logarithm.
-    pub log: bool,
-}
+pub struct Softmax;
 
 impl<T: Scalar> Op<T> for Softmax {
     fn name(&self) -> &'static str {
-        if self.log { "log_softmax" } else { "softmax" }
+        "softmax"
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
@@ -49,8 +65,7 @@ impl<T: Scalar> Op<T> for Softmax {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let kernel = if self.log { rows::log_softmax_rows::<T> } else { rows::softmax_rows::<T> };
-        by_rows(x[0], pool, |x, n, out| kernel(x, n, out, pool))
+        by_rows(x[0], pool, |x, n, out| rows::softmax_rows(x, n, out, pool))
     }
 
     fn reads(&self) -> Reads {
@@ -60,21 +75,52 @@ impl<T: Scalar> Op<T> for Softmax {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (y, g) = (cx.y(), cx.g());
         if cx.recording() {
-            return Grads::one(if self.log {
-                g - power_times(&y, &g.sum_over(kept_last()))
-            } else {
-                &y * (g - (g * &y).sum_over(kept_last()))
-            });
+            return Grads::one(in_range(g, |g| &y * (g - (g * &y).sum_over(kept_last()))));
         }
-        let kernel = if self.log { rows::log_softmax_rows_grad::<T> } else { rows::softmax_rows_grad::<T> };
         let g = g.value().as_slice();
-        Grads::one(cx.constant(by_rows(y.value(), cx.pool(), |y, n, out| kernel(y, g, n, out))))
+        Grads::one(cx.constant(by_rows(y.value(), cx.pool(), |y, n, out| rows::softmax_rows_grad(y, g, n, out))))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         let powers = x[0].exp();
-        let sum = powers.sum_over(kept_last());
-        Some(if self.log { &x[0] - sum.ln() } else { &powers / sum })
+        Some(&powers / powers.sum_over(kept_last()))
+    }
+}
+
+/// y = x - max - ln sum e^(x - max) along the last axis; dx = g - softmax(x) sum g.
+#[derive(Clone, Copy)]
+pub struct LogSoftmax;
+
+impl<T: Scalar> Op<T> for LogSoftmax {
+    fn name(&self) -> &'static str {
+        "log_softmax"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        Ok(last_axis(x[0])?.0)
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        by_rows(x[0], pool, |x, n, out| rows::log_softmax_rows(x, n, out, pool))
+    }
+
+    fn reads(&self) -> Reads {
+        // The output is rounded, and a power of it would be off by as many units as it is large.
+        Reads::INPUTS
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (x, g) = (cx.x(0), cx.g());
+        if cx.recording() {
+            return Grads::one(in_range(g, |g| g - softmax_times(&x, &g.sum_over(kept_last()))));
+        }
+        let kernel =
+            |x: &[T], n, out: &mut [T]| rows::log_softmax_rows_grad(x, g.value().as_slice(), n, out, cx.pool());
+        Grads::one(cx.constant(by_rows(x.value(), cx.pool(), kernel)))
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        Some(&x[0] - x[0].exp().sum_over(kept_last()).ln())
     }
 }
 
@@ -111,10 +157,10 @@ impl<T: Scalar> Op<T> for LogSumExp {
             column.push(1);
             let is_lost = cx.y().value().map(|y| if y == T::from_f64(f64::NEG_INFINITY) { T::ONE } else { T::ZERO });
             let is_lost = is_lost.reshape(&column).broadcast_to(x.shape()).gt(T::ZERO);
-            // The logarithms of a row of -inf are NaN, and so would their gradients be that are not chosen.
+            // The powers of a row of -inf are NaN, and so would their gradients be that are not chosen.
             let kept = x.constant(0.0).where_(&is_lost, &x);
-            let logarithms = x.constant(f64::NEG_INFINITY).where_(&is_lost, kept.log_softmax(-1));
-            return Grads::one(power_times(&logarithms, &g.reshape(&column)));
+            let multiples = softmax_times(&kept, &g.reshape(&column));
+            return Grads::one(x.constant(0.0).where_(&is_lost, multiples));
         }
         let kernel = |x: &[T], n, out: &mut [T]| rows::logsumexp_rows_grad(x, n, g.value().as_slice(), out, cx.pool());
         Grads::one(cx.constant(by_rows(x.value(), cx.pool(), kernel)))
@@ -158,7 +204,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist.
     #[track_caller]
     pub fn softmax(&self, axis: isize) -> Self {
-        self.along(axis, Softmax { log: false })
+        self.along(axis, Softmax)
     }
 
     /// The logarithm of [`softmax`](Self::softmax) along `axis`. Accurate even where the softmax underflows.
@@ -167,7 +213,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist.
     #[track_caller]
     pub fn log_softmax(&self, axis: isize) -> Self {
-        self.along(axis, Softmax { log: true })
+        self.along(axis, LogSoftmax)
     }
 
     /// `ln(sum(e^self))` of all elements, as a scalar; see [`logsumexp_over`](Self::logsumexp_over).

@@ -10,4 +10,5 @@ mod peers;
 mod random_graphs;
 mod range;
 mod reductions;
+mod rows;
 mod scans;

@@ -3,7 +3,7 @@
 use super::{ROW_ELEMENT, block, blocks, check_rows, check_whole, fold_lanes, total, totals_of};
 use crate::parallel::chunks;
 use crate::scale::power_of_two;
-use crate::{Pool, Scalar, Tensor, simd};
+use crate::{Pool, Scalar, Tensor, Wide, simd};
 
 /// The largest element of a row without NaN; a row with NaN results in NaN anyway.
 #[inline(always)]
@@ -37,6 +37,36 @@ fn exponentials<T: Scalar>(x: &mut [T]) {
     }
 }
 
+/// `power`, which is `e^(x - shift)`, with the rounding error of the difference (Knuth's two-sum). Without it, a power is
+/// off by as many units as its exponent is large.
+#[inline(always)]
+pub fn corrected<T: Scalar>(power: T, x: T, shift: T) -> T {
+    let difference = x - shift;
+    let back = difference + shift;
+    let low = (x - back) + ((back - difference) - shift);
+    // The error of an infinity is no number, and its power is 0 or infinite.
+    power.mul_add(if low < T::ONE { low } else { T::ONE }, power)
+}
+
+/// The powers of the rows that [`shifted`] has shifted, in their place.
+#[inline(always)]
+fn exponentials_of_shifted<T: Scalar>(x: &[T], n: usize, out: &mut [T], shifts: &[T]) {
+    exponentials(out);
+    for ((x, out), &shift) in x.chunks_exact(n).zip(out.chunks_exact_mut(n)).zip(shifts) {
+        let least = fold_lanes(
+            x,
+            #[inline(always)]
+            |a, b| if b < a { b } else { a },
+        );
+        // Up to there, the rounding error is at most two units of the power.
+        if shift - least > T::from_f64(8.0) {
+            for (out, &x) in out.iter_mut().zip(x) {
+                *out = corrected(*out, x, shift);
+            }
+        }
+    }
+}
+
 /// `ln sum x` of powers of which at least one is 1, unless the row was not shifted by a finite element. It leaves one 1
 /// out of the sum and uses `ln(1 + x)`, so that small contributions of the others are not rounded off.
 #[inline(always)]
@@ -50,47 +80,87 @@ fn ln_total<T: Scalar>(powers: &[T]) -> T {
     (rest + (ones - T::ONE)).ln1p()
 }
 
-/// Whether `factor` times a power of a row may be in range although the power is not. `least` is the least element in
-/// range of a row of powers or of their logarithms.
+/// Whether `factor` times a power of a row may be in range although the power is not.
 #[inline(always)]
-fn lifts<T: Scalar>(factor: T, row: &[T], least: [f64; 2]) -> bool {
+fn lifts<T: Scalar>(factor: T, powers: &[T]) -> bool {
     if factor.abs() <= T::ONE {
         return false;
     }
-    let least = T::from_f64(least[usize::from(size_of::<T>() == 8)]);
     let smallest = fold_lanes(
-        row,
+        powers,
         #[inline(always)]
         |a, b| if b < a { b } else { a },
     );
-    smallest < least
+    smallest < T::from_f64(power_of_two(if size_of::<T>() == 4 { -126 } else { -1022 }))
 }
 
-/// `out = e^logarithm * factor`, where the power may underflow and the factor brings it back.
+/// `out = e^(x - shift) * factor`, where the power may underflow and the factor brings it back.
 #[cold]
 #[inline(never)]
-fn large_multiples<T: Scalar>(logarithms: &[T], factor: T, out: &mut [T]) {
+fn large_multiples<T: Scalar>(x: &[T], shift: T, factor: T, out: &mut [T]) {
     simd::dispatch(
         #[inline(always)]
         || {
-            for (out, &logarithm) in out.iter_mut().zip(logarithms) {
-                let root = (T::from_f64(0.5) * logarithm).exp();
-                *out = root * factor * root;
+            for (out, &x) in out.iter_mut().zip(x) {
+                let root = (T::from_f64(0.5) * (x - shift)).exp();
+                *out = corrected(root * factor * root, x, shift);
             }
         },
     );
 }
 
-/// `g - powers * sum g` in place of the powers, where the sum is out of range.
-#[cold]
-#[inline(never)]
-fn large_differences<T: Scalar>(g: &[T], powers: &mut [T]) {
-    let [down, up] = [-40, 40].map(|exponent| T::from_f64(power_of_two(exponent)));
-    let small: Vec<T> = g.iter().map(|&g| g * down).collect();
-    let sum = total(&small);
-    for (out, &g) in powers.iter_mut().zip(&small) {
-        *out = (g - *out * sum) * up;
+/// A row whose powers are known up to a factor.
+struct Powers<'a, T> {
+    x: &'a [T],
+    /// The largest element.
+    greatest: T,
+    /// The reciprocal of the sum of the powers `e^(x - greatest)`.
+    scale: T,
+}
+
+impl<T: Scalar> Powers<'_, T> {
+    /// Replaces the powers in `row` with `g` times the softmax.
+    #[inline(always)]
+    fn multiply(&self, row: &mut [T], g: T) {
+        let factor = g * self.scale;
+        if lifts(g, row) {
+            large_multiples(self.x, self.greatest, factor, row);
+        } else {
+            for out in row {
+                *out *= factor;
+            }
+        }
     }
+}
+
+/// Calls `finish(row number, the row, powers)` for each row of `out`, which holds `e^(x - greatest)`.
+#[track_caller]
+fn softmaxes<T: Scalar>(
+    x: &[T],
+    n: usize,
+    out: &mut [T],
+    pool: &Pool<T>,
+    finish: impl Fn(usize, &Powers<'_, T>, &mut [T]) + Sync,
+) {
+    check_whole(x.len(), n);
+    if x.is_empty() {
+        return;
+    }
+    blocks(&mut out[..x.len()], n, block(n) / n, pool, &|shifts, start, out| {
+        let (x, first) = (&x[start..][..out.len()], start / n);
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                shifted(x, n, out, shifts, false);
+                exponentials_of_shifted(x, n, out, shifts);
+                let rows = x.chunks_exact(n).zip(out.chunks_exact_mut(n)).zip(&*shifts);
+                for (i, ((x, row), &greatest)) in rows.enumerate() {
+                    let scale = T::ONE / total(row);
+                    finish(first + i, &Powers { x, greatest, scale }, row);
+                }
+            },
+        );
+    });
 }
 
 /// Softmax of each row of `n` elements: `e^(x - max) / sum e^(x - max)`.
@@ -99,29 +169,29 @@ fn large_differences<T: Scalar>(g: &[T], powers: &mut [T]) {
 /// If `x` is not whole rows of `n`, or `out` is shorter than `x`.
 #[track_caller]
 pub fn softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>) {
-    check_whole(x.len(), n);
-    if x.is_empty() {
-        return;
-    }
-    blocks(&mut out[..x.len()], n, block(n) / n, pool, &|shifts, start, out| {
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                shifted(&x[start..][..out.len()], n, out, shifts, false);
-                exponentials(out);
-                for row in out.chunks_exact_mut(n) {
-                    let scale = T::ONE / total(row);
-                    for out in row {
-                        *out *= scale;
-                    }
-                }
-            },
-        );
-    });
+    softmaxes(
+        x,
+        n,
+        out,
+        pool,
+        #[inline(always)]
+        |_, powers, row| powers.multiply(row, T::ONE),
+    );
 }
 
-/// The gradient of softmax from its output: `y (g - sum g y)` in each row. A probability that has underflowed has
-/// gradient 0, also where a large `g` would bring it back into range.
+/// The gradient of softmax of a row where `sum g y`, or a difference from it, may be out of range.
+#[cold]
+#[inline(never)]
+fn large_softmax_grad<T: Scalar>(y: &[T], g: &[T], out: &mut [T]) {
+    let [down, up] = [0.25, 4.0].map(T::from_f64);
+    let [mean] = totals_of(y, g, |y, g| [y * (g * down)]);
+    for i in 0..y.len() {
+        out[i] = y[i] * (g[i] * down - mean) * up;
+    }
+}
+
+/// The gradient of softmax from its output: `y (g - sum g y)` in each row. A probability that has underflowed counts as
+/// 0, also where a large `g` would bring it back into range.
 ///
 /// # Panics
 /// If `y` is not whole rows of `n`, or `g` or `out` is shorter than `y`.
@@ -133,7 +203,6 @@ pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
     }
     // Up to this size, no difference from a mean overflows.
     let largest_mean = T::from_f64(power_of_two(if size_of::<T>() == 4 { 100 } else { 960 }));
-    let quarter = [0.25, 4.0].map(T::from_f64);
     blocks(&mut out[..y.len()], n, 0, &Pool::none(), &|_, start, out| {
         let len = out.len();
         let (y, g) = (&y[start..][..len], &g[start..][..len]);
@@ -147,9 +216,12 @@ pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
                         #[inline(always)]
                         |y, g| [y * g],
                     );
-                    let [down, up] = if mean.abs() > largest_mean { quarter } else { [T::ONE; 2] };
-                    for i in 0..n {
-                        out[i] = y[i] * (g[i] * down - mean * down) * up;
+                    if mean.abs() <= largest_mean {
+                        for i in 0..n {
+                            out[i] = y[i] * (g[i] - mean);
+                        }
+                    } else {
+                        large_softmax_grad(y, g, out);
                     }
                 }
             },
@@ -169,13 +241,14 @@ pub fn log_softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool
     }
     blocks(&mut out[..x.len()], n, block(n) + block(n) / n, pool, &|scratch, start, out| {
         let (powers, shifts) = scratch.split_at_mut(block(n));
+        let x = &x[start..][..out.len()];
         simd::dispatch(
             #[inline(always)]
             || {
                 let powers = &mut powers[..out.len()];
-                shifted(&x[start..][..out.len()], n, out, shifts, false);
+                shifted(x, n, out, shifts, false);
                 powers.copy_from_slice(out);
-                exponentials(powers);
+                exponentials_of_shifted(x, n, powers, shifts);
                 for (out, powers) in out.chunks_exact_mut(n).zip(powers.chunks_exact(n)) {
                     let ln = ln_total(powers);
                     for out in out {
@@ -187,42 +260,45 @@ pub fn log_softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool
     });
 }
 
-/// The gradient of log-softmax from its output: `g - e^y sum g` in each row.
+/// The gradient of log-softmax, `g - softmax(x) sum g` in each row.
 ///
 /// # Panics
-/// If `y` is not whole rows of `n`, or `g` or `out` is shorter than `y`.
+/// If `x` is not whole rows of `n`, or `g` or `out` is shorter than `x`.
 #[track_caller]
-pub fn log_softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
-    check_whole(y.len(), n);
-    if y.is_empty() {
-        return;
+pub fn log_softmax_rows_grad<T: Scalar>(x: &[T], g: &[T], n: usize, out: &mut [T], pool: &Pool<T>) {
+    /// `g - softmax(x) sum g` of a row, of which the sum is out of range.
+    #[cold]
+    #[inline(never)]
+    fn large_differences<T: Scalar>(powers: &Powers<'_, T>, g: &[T], out: &mut [T]) {
+        let exponent = 1 + i64::from(g.len().ilog2());
+        let [down, up] = [-exponent, exponent].map(|exponent| T::from_f64(power_of_two(exponent)));
+        let [sum] = totals_of(g, g, |g, _| [g * down]);
+        let factor = powers.scale.wide() * sum.wide();
+        for (i, &x) in powers.x.iter().enumerate() {
+            let shift = powers.greatest;
+            let small = T::Wide::exp(x - shift, T::ZERO) * corrected(T::ONE, x, shift).wide() * factor;
+            let product = (small * up.wide()).narrow();
+            out[i] = if product.is_finite() { g[i] - product } else { (g[i] * down - small.narrow()) * up };
+        }
     }
-    blocks(&mut out[..y.len()], n, 0, &Pool::none(), &|_, start, out| {
-        let g = &g[start..][..out.len()];
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                let y = &y[start..][..out.len()];
-                out.copy_from_slice(y);
-                exponentials(out);
-                for ((out, y), g) in out.chunks_exact_mut(n).zip(y.chunks_exact(n)).zip(g.chunks_exact(n)) {
-                    let sum = total(g);
-                    if !sum.is_finite() {
-                        large_differences(g, out);
-                        continue;
-                    }
-                    let mut factor = sum;
-                    if lifts(sum, y, [-87.0, -708.0]) {
-                        large_multiples(y, sum, out);
-                        factor = T::ONE;
-                    }
-                    for i in 0..n {
-                        out[i] = g[i] - out[i] * factor;
-                    }
-                }
-            },
-        );
-    });
+    softmaxes(
+        x,
+        n,
+        out,
+        pool,
+        #[inline(always)]
+        |i, powers, row| {
+            let g = &g[i * n..][..row.len()];
+            let sum = total(g);
+            if !sum.is_finite() {
+                return large_differences(powers, g, row);
+            }
+            powers.multiply(row, sum);
+            for i in 0..row.len() {
+                row[i] = g[i] - row[i];
+            }
+        },
+    );
 }
 
 /// `ln sum e^x` of each row of `n` elements. It is -inf for an empty row and for a row of -inf alone.
@@ -251,8 +327,9 @@ fn ln_sums<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>, finish: 
             #[inline(always)]
             || {
                 let powers = &mut powers[..n * out.len()];
-                shifted(&x[n * first..][..n * out.len()], n, powers, shifts, true);
-                exponentials(powers);
+                let x = &x[n * first..][..n * out.len()];
+                shifted(x, n, powers, shifts, true);
+                exponentials_of_shifted(x, n, powers, shifts);
                 for (out, powers) in out.iter_mut().zip(powers.chunks_exact(n)) {
                     *out = ln_total(powers);
                 }
@@ -282,51 +359,20 @@ pub fn cross_entropy_rows<T: Scalar>(x: &[T], n: usize, classes: &[u32], out: &m
 /// If `x` is not `g.len()` rows of `n`, or `out` is shorter than `x`.
 #[track_caller]
 pub fn logsumexp_rows_grad<T: Scalar>(x: &[T], n: usize, g: &[T], out: &mut [T], pool: &Pool<T>) {
-    softmax_multiples(x, n, g, out, pool, |_, row, is_lost| {
-        if is_lost {
-            row.fill(T::ZERO);
-        }
-    });
-}
-
-/// `g` times the softmax of each row, which `finish(row number, multiples, whether all elements are -inf)` may change.
-#[track_caller]
-fn softmax_multiples<T: Scalar>(
-    x: &[T],
-    n: usize,
-    g: &[T],
-    out: &mut [T],
-    pool: &Pool<T>,
-    finish: impl Fn(usize, &mut [T], bool) + Sync,
-) {
     check_rows(x.len(), n, g.len());
-    softmax_rows(x, n, out, pool);
-    if x.is_empty() {
-        return;
-    }
-    blocks(&mut out[..x.len()], n, 0, pool, &|_, start, out| {
-        let first = start / n;
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                let rows = out.chunks_exact_mut(n).zip(x[start..].chunks_exact(n));
-                for (i, ((row, x), &g)) in rows.zip(&g[first..]).enumerate() {
-                    let greatest = top(x);
-                    if lifts(g, row, [f32::MIN_POSITIVE.into(), f64::MIN_POSITIVE]) {
-                        // The power of the greatest logit is 1.
-                        let scale = top(row);
-                        let shifted: Vec<T> = x.iter().map(|&x| x - greatest).collect();
-                        large_multiples(&shifted, g * scale, row);
-                    } else {
-                        for out in &mut *row {
-                            *out *= g;
-                        }
-                    }
-                    finish(first + i, row, greatest == T::from_f64(f64::NEG_INFINITY));
-                }
-            },
-        );
-    });
+    softmaxes(
+        x,
+        n,
+        out,
+        pool,
+        #[inline(always)]
+        |i, powers, row| {
+            powers.multiply(row, g[i]);
+            if powers.greatest == T::from_f64(f64::NEG_INFINITY) {
+                row.fill(T::ZERO);
+            }
+        },
+    );
 }
 
 /// The gradient of [`cross_entropy_rows`]: `g (softmax - 1 at the class)`. Where 1 minus the probability of the class
@@ -338,10 +384,19 @@ fn softmax_multiples<T: Scalar>(
 #[track_caller]
 pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g: &[T], out: &mut [T], pool: &Pool<T>) {
     assert_eq!(classes.len(), g.len(), "a class for each gradient");
-    softmax_multiples(x, n, g, out, pool, |i, row, _| {
-        row[classes[i] as usize] = T::ZERO;
-        row[classes[i] as usize] = -total(row);
-    });
+    check_rows(x.len(), n, g.len());
+    softmaxes(
+        x,
+        n,
+        out,
+        pool,
+        #[inline(always)]
+        |i, powers, row| {
+            powers.multiply(row, g[i]);
+            row[classes[i] as usize] = T::ZERO;
+            row[classes[i] as usize] = -total(row);
+        },
+    );
 }
 
 #[cfg(test)]
@@ -421,11 +476,11 @@ mod tests {
         assert_panics(|| softmax_rows(&x, 3, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 3");
         assert_panics(|| softmax_rows_grad(&x, &x, 3, &mut [0.0; 7]), "7 numbers are not whole rows of 3");
         assert_panics(|| log_softmax_rows(&x, 3, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 3");
-        assert_panics(|| log_softmax_rows_grad(&x, &x, 3, &mut [0.0; 7]), "7 numbers are not whole rows of 3");
+        assert_panics(|| log_softmax_rows_grad(&x, &x, 3, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 3");
         assert_panics(|| softmax_rows(&x, 0, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 0");
         assert_panics(|| softmax_rows_grad(&x, &x, 0, &mut [0.0; 7]), "7 numbers are not whole rows of 0");
         assert_panics(|| log_softmax_rows(&x, 0, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 0");
-        assert_panics(|| log_softmax_rows_grad(&x, &x, 0, &mut [0.0; 7]), "7 numbers are not whole rows of 0");
+        assert_panics(|| log_softmax_rows_grad(&x, &x, 0, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 0");
         assert_panics(|| logsumexp_rows(&x, 3, &mut [0.0; 2], &pool), "7 numbers are not 2 rows of 3");
         // 2^63 times 2 wraps to the 0 numbers that there are.
         assert_panics(|| logsumexp_rows(&[], 1 << 63, &mut [0.0_f32; 2], &pool), "0 numbers are not 2 rows of");

@@ -6,7 +6,7 @@
 //! `ACCURACY_ONLY=gelu,tanh` and `ACCURACY_OPERANDS=1` select operations. `ACCURACY_DUMP` names a folder for arguments and exact results, which
 //! `benches/peers/accuracy.py` reads. [`singles`] has many more cases in f32.
 
-mod exact;
+pub mod exact;
 mod operations;
 mod singles;
 
@@ -48,14 +48,14 @@ const FUNCTIONS: [&str; 24] = [
 ];
 
 /// A float format.
-struct Format {
-    digits: i64,
-    least: i64,
-    greatest: i64,
+pub struct Format {
+    pub digits: i64,
+    pub least: i64,
+    pub greatest: i64,
 }
 
 impl Format {
-    fn of<T: Scalar>() -> Format {
+    pub fn of<T: Scalar>() -> Format {
         if size_of::<T>() == 4 {
             Format { digits: 23, least: -126, greatest: 127 }
         } else {
@@ -72,7 +72,7 @@ impl Format {
 
     /// The error of `got`, in units in the last place of the exact result or of its largest term. Infinite where the
     /// result should be infinite or NaN and is not, or the other way round.
-    fn error(&self, got: f64, exact: Exact, term: Exact) -> f64 {
+    pub fn error(&self, got: f64, exact: Exact, term: Exact) -> f64 {
         if !exact.is_finite() {
             let same = got == exact.to_f64() || got.is_nan() && exact.to_f64().is_nan();
             return if same { 0.0 } else { f64::INFINITY };
@@ -92,7 +92,7 @@ impl Format {
 }
 
 /// Random bits (SplitMix64).
-struct Random(u64);
+pub struct Random(u64);
 
 /// The number in the environment variable.
 fn setting(name: &str) -> Option<usize> {
@@ -108,7 +108,7 @@ fn is_asked(name: &str, operands: usize) -> bool {
 
 impl Random {
     /// For a case of an operation.
-    fn of(name: &str, case: u64) -> Random {
+    pub fn of(name: &str, case: u64) -> Random {
         // FNV-1a: every operation has cases of its own.
         let hash = name
             .bytes()
@@ -118,19 +118,19 @@ impl Random {
         Random(random.bits() ^ case)
     }
 
-    fn bits(&mut self) -> u64 {
+    pub fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let x = (self.0 ^ self.0 >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
         let x = (x ^ x >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
         x ^ x >> 31
     }
 
-    fn below(&mut self, n: i64) -> i64 {
+    pub fn below(&mut self, n: i64) -> i64 {
         ((u128::from(self.bits()) * n as u128) >> 64) as i64
     }
 
     /// A number with this exponent, of either sign.
-    fn of_exponent<T: Scalar>(&mut self, exponent: i64) -> f64 {
+    pub fn of_exponent<T: Scalar>(&mut self, exponent: i64) -> f64 {
         let fraction = 1.0 + self.bits() as f64 / 2.0_f64.powi(64);
         // Rounded to the type; instead of an overflow, half of the power of two.
         let x = T::from_f64(scaled(fraction, exponent)).to_f64();
@@ -139,7 +139,7 @@ impl Random {
     }
 
     /// Any finite bit pattern.
-    fn pattern<T: Scalar>(&mut self) -> f64 {
+    pub fn pattern<T: Scalar>(&mut self) -> f64 {
         loop {
             let bytes = self.bits().to_le_bytes();
             let x = T::read_le(&bytes[..size_of::<T>()])[0].to_f64();

@@ -1,0 +1,167 @@
+//! Softmax and its relatives of rows of all bits, against 100-bit arithmetic.
+//! Values and gradients are compared one by one; where terms cancel, in units of the largest one.
+
+use crate::accuracy::exact::Exact;
+use crate::accuracy::{Format, Random};
+use raygrad_autograd::{Scalar, Tape, Tensor, Var};
+
+const ROWS: u64 = 1500;
+
+/// Numbers of the type.
+fn rounded<T: Scalar>(x: Vec<f64>) -> Vec<f64> {
+    let finite = |x: f64| if T::from_f64(x).is_finite() { T::from_f64(x).to_f64() } else { 0.0 };
+    x.into_iter().map(finite).collect()
+}
+
+fn many(n: usize, mut one: impl FnMut() -> f64) -> Vec<f64> {
+    (0..n).map(|_| one()).collect()
+}
+
+/// A number with one of the `count` exponents from `least` on.
+fn of_size<T: Scalar>(random: &mut Random, least: i64, count: i64) -> f64 {
+    let exponent = least + random.below(count);
+    random.of_exponent::<T>(exponent.max(Format::of::<T>().least))
+}
+
+/// Logits of all bits, of sizes whose powers are in range and of larger ones, and far from 0.
+fn logits<T: Scalar>(random: &mut Random, n: usize) -> Vec<f64> {
+    let (kind, far, greatest) = (random.below(5), of_size::<T>(random, 0, 20), if T::NAME == "f32" { 6 } else { 9 });
+    rounded::<T>(many(n, || match kind {
+        0 => random.pattern::<T>(),
+        1 => far + of_size::<T>(random, -3, greatest + 4),
+        2 => of_size::<T>(random, greatest - 2, 3),
+        _ => of_size::<T>(random, -12, greatest + 13),
+    }))
+}
+
+/// Incoming gradients, gains and biases: ones, of ordinary sizes, of all bits, one alone, or the largest numbers; and
+/// whether they are of ordinary sizes.
+fn factors<T: Scalar>(random: &mut Random, n: usize) -> (Vec<f64>, bool) {
+    let (kind, place, greatest) = (random.below(6), random.below(n as i64) as usize, Format::of::<T>().greatest);
+    let mut i = 0;
+    let factors = many(n, || {
+        i += 1;
+        match kind {
+            0 => 1.0,
+            1 => of_size::<T>(random, -3, 7),
+            2 => random.of_exponent::<T>(greatest).abs(),
+            3 if i != place + 1 => 0.0,
+            _ => random.pattern::<T>(),
+        }
+    });
+    (rounded::<T>(factors), kind < 2)
+}
+
+/// The value of a function of a row and vectors of its length, its gradients, and those of a recorded pass.
+fn evaluate<T: Scalar>(x: &[&[f64]], g: &[f64], f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>) -> [Vec<Vec<f64>>; 3] {
+    let tape = Tape::<T>::new();
+    let tensor = |x: &[f64]| Tensor::from_fn(&[x.len()], |i| T::from_f64(x[i]));
+    let leaves: Vec<_> = x.iter().map(|x| tape.leaf(tensor(x))).collect();
+    let wrt: Vec<_> = leaves.iter().collect();
+    let y = f(&leaves);
+    let g = tape.constant(tensor(g).reshape(y.shape()));
+    let numbers = |x: &Var<'_, T>| x.value().iter().map(T::to_f64).collect::<Vec<_>>();
+    let plain = tape.no_grad(|| y.vjp(&g, &wrt)).iter().map(numbers).collect();
+    let recorded = y.vjp(&g, &wrt).iter().map(numbers).collect();
+    [vec![numbers(&y)], plain, recorded]
+}
+
+/// Fails if a number is further than `gate` units in the last place from the exact one, or from its largest term.
+#[track_caller]
+fn check<T: Scalar>(what: &str, row: &[f64], got: &[f64], exact: &[[Exact; 2]], gate: f64) {
+    let format = Format::of::<T>();
+    for (i, (&got, &[exact, term])) in got.iter().zip(exact).enumerate() {
+        // Of terms that overflow and cancel, the rounding errors overflow too.
+        let is_noise = exact.abs() < term.abs().shifted(-16);
+        if is_noise && term.abs() >= Exact::new(1.0).shifted(format.greatest) {
+            continue;
+        }
+        let error = format.error(got, exact, term);
+        assert!(
+            error <= gate,
+            "{what}, in {}, at element {i} of x {row:?}: {got:e} for {:e}, {error} units off",
+            T::NAME,
+            exact.to_f64()
+        );
+    }
+}
+
+fn exacts(x: &[f64]) -> Vec<Exact> {
+    x.iter().map(|&x| Exact::new(x)).collect()
+}
+
+fn sum(x: impl IntoIterator<Item = Exact>) -> Exact {
+    x.into_iter().fold(Exact::ZERO, |sum, x| sum + x)
+}
+
+fn largest(x: impl IntoIterator<Item = Exact>) -> Exact {
+    x.into_iter().map(Exact::abs).fold(Exact::ZERO, |a, b| if b > a { b } else { a })
+}
+
+fn softmaxes<T: Scalar>() {
+    for case in 0..ROWS {
+        let random = &mut Random::of("softmax", case);
+        let n = 1 + random.below(if case % 16 == 0 { 40 } else { 7 }) as usize;
+        let (x, (g, _), class) = (logits::<T>(random, n), factors::<T>(random, n), random.below(n as i64) as usize);
+        // The powers of rows of fewer than 32 are added one after another.
+        let gate = (4.0 + 0.5 * n as f64).max(8.0);
+        let most = x.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let apart: Vec<_> = x.iter().map(|&x| Exact::new(x) - Exact::new(most)).collect();
+        let powers: Vec<_> = apart.iter().map(|x| x.exp()).collect();
+        let first = x.iter().position(|&x| x == most).unwrap_or(0);
+        let others = sum((0..n).filter(|&i| i != first).map(|i| powers[i]));
+        let (ln, total) = (others.ln1p(), others + Exact::new(1.0));
+        let p: Vec<_> = powers.iter().map(|&power| power / total).collect();
+        let alone = |x: Exact| [x, Exact::ZERO];
+        let g_exact = exacts(&g);
+
+        let [y, plain, recorded] = evaluate::<T>(&[&x], &g, |x| x[0].softmax(-1));
+        check::<T>("softmax", &x, &y[0], &p.iter().map(|&p| alone(p)).collect::<Vec<_>>(), gate);
+        // An underflowed probability counts as 0.
+        let least = Exact::new(1.0).shifted(Format::of::<T>().least);
+        if p.iter().zip(&g).all(|(&p, &g)| p >= least || g == 0.0) {
+            let terms: Vec<_> = p.iter().zip(&g_exact).map(|(&p, &g)| p * g).collect();
+            let (mean, term) = (sum(terms.iter().copied()), largest(terms));
+            let kept: Vec<_> = (0..n).filter(|&i| p[i] >= least).collect();
+            let dx = |i: &usize| [p[*i] * (g_exact[*i] - mean), p[*i] * largest([g_exact[*i], term])];
+            let exact: Vec<_> = kept.iter().map(dx).collect();
+            for (what, dx) in [("gradient of softmax", plain), ("recorded gradient of softmax", recorded)] {
+                check::<T>(what, &x, &kept.iter().map(|&i| dx[0][i]).collect::<Vec<_>>(), &exact, 1.5 * gate);
+            }
+        }
+
+        let [y, plain, recorded] = evaluate::<T>(&[&x], &g, |x| x[0].log_softmax(-1));
+        check::<T>("log_softmax", &x, &y[0], &apart.iter().map(|&x| alone(x - ln)).collect::<Vec<_>>(), gate);
+        let (of_g, term) = (sum(g_exact.iter().copied()), largest(g_exact.iter().copied()));
+        let exact: Vec<_> = (0..n).map(|i| [g_exact[i] - p[i] * of_g, largest([g_exact[i], p[i] * term])]).collect();
+        if y[0].iter().all(|y| y.is_finite()) {
+            check::<T>("gradient of log_softmax", &x, &plain[0], &exact, gate);
+            // Recorded in smaller units, in which elements close to the subnormal numbers lose digits.
+            let is_large = term >= Exact::new(1.0).shifted(Format::of::<T>().greatest - 8);
+            let unit = if is_large { least.shifted(8) } else { Exact::ZERO };
+            let exact: Vec<_> = exact.iter().map(|&[dx, term]| [dx, largest([term, unit])]).collect();
+            check::<T>("recorded gradient of log_softmax", &x, &recorded[0], &exact, gate);
+        }
+
+        let [y, plain, recorded] = evaluate::<T>(&[&x], &g[..1], |x| x[0].reshape(&[1, n]).logsumexp_over(-1));
+        let top = Exact::new(most);
+        check::<T>("logsumexp", &x, &y[0], &[[top + ln, largest([top, ln])]], gate);
+        let mut exact: Vec<_> = p.iter().map(|&p| alone(p * g_exact[0])).collect();
+        check::<T>("gradient of logsumexp", &x, &plain[0], &exact, gate);
+        check::<T>("recorded gradient of logsumexp", &x, &recorded[0], &exact, gate);
+
+        let [y, plain, _] = evaluate::<T>(&[&x], &g[..1], |x| x[0].reshape(&[1, n]).cross_entropy([class as u32]));
+        check::<T>("cross_entropy", &x, &y[0], &[alone(ln - apart[class])], gate);
+        if y[0][0].is_finite() {
+            let others = sum((0..n).filter(|&i| i != class).map(|i| p[i]));
+            exact[class] = alone(-others * g_exact[0]);
+            check::<T>("gradient of cross_entropy", &x, &plain[0], &exact, gate);
+        }
+    }
+}
+
+#[test]
+fn softmax_and_its_relatives_of_all_bits() {
+    softmaxes::<f32>();
+    softmaxes::<f64>();
+}
