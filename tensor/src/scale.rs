@@ -12,6 +12,23 @@ pub fn power_of_two(exponent: i64) -> f64 {
     }
 }
 
+/// The exponent of a number: n for 2^n and numbers up to twice as large, below those of all products for 0, -1023 for
+/// subnormal numbers, 1024 for infinity and NaN.
+pub fn exponent<T: Scalar>(x: T) -> i64 {
+    if x == T::ZERO { -10_000 } else { (x.to_f64().to_bits() >> 52 & 0x7ff) as i64 - 1023 }
+}
+
+/// `2^exponent` as a factor, also out of the type's range.
+pub fn wide_power<T: Scalar>(exponent: i64) -> T::Wide {
+    let (mut power, mut rest) = (T::ONE.wide(), exponent);
+    while rest != 0 {
+        let step = rest.clamp(-100, 100);
+        power = power * T::from_f64(power_of_two(step)).wide();
+        rest -= step;
+    }
+    power
+}
+
 /// The largest absolute value; 0 for no elements, NaN if one is NaN.
 #[inline(always)]
 pub fn largest<T: Scalar>(x: &[T]) -> T {
@@ -27,11 +44,7 @@ pub fn largest<T: Scalar>(x: &[T]) -> T {
 pub fn powers<T: Scalar>(size: T) -> [T; 2] {
     // Their reciprocals are no subnormal numbers.
     let most = if size_of::<T>() == 4 { 100 } else { 1000 };
-    let exponent = match size.to_f64() {
-        0.0 => 0,
-        size if !size.is_finite() => 0,
-        size => ((size.to_bits() >> 52 & 0x7ff) as i64 - 1023).clamp(-most, most),
-    };
+    let exponent = if size == T::ZERO || !size.is_finite() { 0 } else { exponent(size).clamp(-most, most) };
     [-exponent, exponent].map(|exponent| T::from_f64(power_of_two(exponent)))
 }
 

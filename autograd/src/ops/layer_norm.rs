@@ -1,8 +1,8 @@
 //! Layer normalisation as one fused operation.
 
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::rows::{layer_norm_rows, layer_norm_rows_grad};
-use raygrad_tensor::scale::scales;
+use raygrad_tensor::rows::{RowUnits, layer_norm_rows, layer_norm_rows_grad};
+use raygrad_tensor::scale::power_of_two;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
 /// y = (x - mean) / sqrt(variance + eps) gain + bias along the last axis, for x `[.., n]`, gain and bias `[n]`. The
@@ -56,13 +56,17 @@ impl<T: Scalar> Op<T> for LayerNorm {
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         let kept = Axes::from(-1).resolve(x[0].shape()).kept();
-        // In units of a power of two for each row, in which squares are in range. It cancels, so it is a constant.
-        let (tape, value) = (x[0].tape(), x[0].value());
-        let least = T::from_f64(self.eps.sqrt().min(1e38));
-        let [down, _] = scales(&value.abs().map(|x| x.maximum(least)), &kept, tape.pool());
-        let eps = down.map(|down| T::from_f64(self.eps * down.to_f64() * down.to_f64()));
-        let centred = (&x[0] * down).centred(&kept);
-        Some(&centred / (centred.square().mean_to(&kept) + eps).sqrt() * &x[1] + &x[2])
+        // In units of powers of two for each row, in which squares are in range. They cancel, so they are constants.
+        let (value, n) = (x[0].value(), x[1].value().len());
+        let rows = kept.iter().product();
+        let units: Vec<_> = (0..rows).map(|i| RowUnits::new(&value.as_slice()[i * n..][..n], self.eps)).collect();
+        let column = |f: &dyn Fn(&RowUnits<T>) -> T| x[0].tape().constant(Tensor::from_fn(&kept, |i| f(&units[i])));
+        let centred = ((&x[0] - column(&|row| row.first)) * column(&|row| row.down)).centred(&kept);
+        // In two factors, which are finite.
+        let power = |exponent: i64| T::from_f64(power_of_two(exponent.min(120)));
+        let [half, rest] = [0, 1].map(|odd| column(&|row| power((row.rest + odd) >> 1)));
+        let variance = (&centred * &half * &rest).square().mean_to(&kept);
+        Some(centred * half / (variance + column(&|row| row.eps)).sqrt() * &x[1] * rest + &x[2])
     }
 }
 

@@ -1,4 +1,4 @@
-//! Softmax and its relatives of rows of all bits, against 100-bit arithmetic.
+//! Softmax and its relatives and layer normalisation of rows of all bits, against 100-bit arithmetic.
 //! Values and gradients are compared one by one; where terms cancel, in units of the largest one.
 
 use crate::accuracy::exact::Exact;
@@ -21,6 +21,22 @@ fn many(n: usize, mut one: impl FnMut() -> f64) -> Vec<f64> {
 fn of_size<T: Scalar>(random: &mut Random, least: i64, count: i64) -> f64 {
     let exponent = least + random.below(count);
     random.of_exponent::<T>(exponent.max(Format::of::<T>().least))
+}
+
+/// Rows of all bits, of one size or of many, close to the subnormal numbers, of neighbours, and of equal numbers.
+fn row<T: Scalar>(random: &mut Random, n: usize) -> Vec<f64> {
+    let Format { least, greatest, digits } = Format::of::<T>();
+    let (kind, size, first) = (random.below(8), least + random.below(greatest - least), random.pattern::<T>());
+    rounded::<T>(many(n, || match kind {
+        0 => random.pattern::<T>(),
+        1 => of_size::<T>(random, size - 2, 3),
+        2 => of_size::<T>(random, size - 30, 30),
+        3 => random.below(9) as f64 * T::EPSILON * 2.0_f64.powi(least as i32),
+        4 => first * (1.0 + random.below(16) as f64 * 2.0_f64.powi(-digits as i32)),
+        5 => first,
+        6 => of_size::<T>(random, greatest - 2, 3),
+        _ => of_size::<T>(random, -3, 5),
+    }))
 }
 
 /// Logits of all bits, of sizes whose powers are in range and of larger ones, and far from 0.
@@ -160,8 +176,67 @@ fn softmaxes<T: Scalar>() {
     }
 }
 
+fn layer_norms<T: Scalar>() {
+    for case in 0..ROWS {
+        let random = &mut Random::of("layer_norm", case);
+        let n = 2 + random.below(6) as usize;
+        let x = row::<T>(random, n);
+        let [(gain, is_gain), (bias, _), (g, is_g)] = [(); 3].map(|()| factors::<T>(random, n));
+        let bias = if case % 2 == 0 { vec![0.0; n] } else { bias };
+        let eps = match random.below(4) {
+            0 => 0.0,
+            1 => 1e-5,
+            2 => random.pattern::<f64>().abs(),
+            _ => random.pattern::<f32>().abs(),
+        };
+        let [wide_x, a, b, wide_g] = [&x, &gain, &bias, &g].map(|x| exacts(x));
+        let count = Exact::new(n as f64);
+        let mean = sum(wide_x.iter().copied()) / count;
+        let apart: Vec<_> = wide_x.iter().map(|&x| x - mean).collect();
+        let variance = sum(apart.iter().map(|x| x.square())) / count + Exact::new(eps);
+        if variance.is_zero() {
+            continue;
+        }
+        let scale = variance.sqrt();
+        let is_equal = x.iter().all(|&other| other == x[0]);
+        let u: Vec<_> = apart.iter().map(|&x| if is_equal { Exact::ZERO } else { x / scale }).collect();
+        // The mean is as exact as the largest element.
+        let unit = if is_equal { Exact::ZERO } else { largest(wide_x.iter().copied()) / scale };
+        let what = |what: &str| format!("{what}, epsilon {eps:e}, gain {gain:?}, bias {bias:?}, g {g:?}");
+        let [y, plain, recorded] = evaluate::<T>(&[&x, &gain, &bias], &g, |x| x[0].layer_norm(&x[1], &x[2], eps));
+        let exact: Vec<_> = (0..n).map(|i| [u[i] * a[i] + b[i], largest([unit * a[i], b[i]])]).collect();
+        let limit = Exact::new(1.0).shifted(Format::of::<T>().greatest);
+        if (0..n).any(|i| (u[i] * a[i]).abs() >= limit) {
+            continue;
+        }
+        check::<T>(&what("layer_norm"), &x, &y[0], &exact, 8.0);
+        let h: Vec<_> = wide_g.iter().zip(&a).map(|(&g, &a)| g * a).collect();
+        let (level, along) = (sum(h.iter().copied()) / count, sum((0..n).map(|i| h[i] * u[i])) / count);
+        let size = largest(h.iter().copied());
+        let term = largest([size, unit * unit * size]) / scale;
+        let dx: Vec<_> = (0..n).map(|i| [(h[i] - level - u[i] * along) / scale, term]).collect();
+        let dgain: Vec<_> = (0..n).map(|i| [wide_g[i] * u[i], wide_g[i] * unit]).collect();
+        let dbias: Vec<_> = wide_g.iter().map(|&g| [g, g]).collect();
+        for (which, grads) in [("gradient", plain), ("recorded gradient", recorded)] {
+            // Recorded gradients have ordinary products.
+            let is_ordinary = is_gain && is_g && (is_equal || unit.exponent() > -40);
+            if which == "gradient" || is_ordinary && dx.iter().all(|dx| dx[0].abs() < limit) {
+                check::<T>(&what(&format!("{which} of layer_norm")), &x, &grads[0], &dx, 8.0);
+                check::<T>(&what(&format!("{which} of layer_norm by gain")), &x, &grads[1], &dgain, 8.0);
+                check::<T>(&what(&format!("{which} of layer_norm by bias")), &x, &grads[2], &dbias, 8.0);
+            }
+        }
+    }
+}
+
 #[test]
 fn softmax_and_its_relatives_of_all_bits() {
     softmaxes::<f32>();
     softmaxes::<f64>();
+}
+
+#[test]
+fn layer_norm_of_all_bits() {
+    layer_norms::<f32>();
+    layer_norms::<f64>();
 }

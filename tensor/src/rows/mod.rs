@@ -7,8 +7,8 @@
 mod moments;
 mod softmax;
 
+pub use moments::{RowUnits, layer_norm_rows, layer_norm_rows_grad, variance_rows};
 pub(crate) use moments::{at_least_zero, in_units};
-pub use moments::{layer_norm_rows, layer_norm_rows_grad, variance_rows};
 pub use softmax::{
     corrected, cross_entropy_rows, cross_entropy_rows_grad, log_softmax_rows, log_softmax_rows_grad, logsumexp_rows,
     logsumexp_rows_grad, softmax_rows, softmax_rows_grad,

@@ -2,8 +2,8 @@
 
 use super::{ROW_ELEMENT, block, blocks, check_rows, check_whole, total, totals_of};
 use crate::parallel::chunks;
-use crate::scale::{is_safe, largest, powers};
-use crate::{Pool, Scalar, Tensor, simd};
+use crate::scale::{exponent, is_safe, largest, power_of_two, powers, wide_power};
+use crate::{Pool, Scalar, Tensor, Wide, simd};
 
 /// Rows whose gradients are summed in their own type before they are added to f64 sums.
 const GROUP: usize = 16;
@@ -82,37 +82,128 @@ pub fn variance_rows<T: Scalar>(x: &[T], n: usize, ratio: T, root: bool, out: &m
     });
 }
 
-/// What normalises a row: `((x - mean[0]) - mean[1]) * scale`, for the elements times the power of two `down`.
+/// What normalises a row: `((x - mean[0]) - mean[1]) * scale`.
 struct Standard<T> {
     mean: [T; 2],
     scale: T,
-    down: T,
 }
 
-/// The row, and what normalises it. Where squares leave the range of the type, it is a multiple of the row in `space`.
+/// What normalises a row, unless squares or deviations leave the range of the type: see [`scaled`].
 #[inline(always)]
-fn standard<'a, T: Scalar>(x: &'a [T], eps: f64, space: &'a mut Vec<T>) -> (&'a [T], Standard<T>) {
+fn standard<T: Scalar>(x: &[T], eps: f64) -> Option<Standard<T>> {
+    /// Whether no deviation loses digits as a subnormal number, before and after it is scaled. All may be 0.
     #[cold]
     #[inline(never)]
-    fn scaled<T: Scalar>(x: &[T], eps: f64, space: &mut Vec<T>) -> Standard<T> {
-        let [down, _] = powers(largest(x).maximum(T::from_f64(eps.sqrt().min(1e38))));
-        *space = times(x, down);
-        let (mean, variance) = moments(space);
-        // In f64, where epsilon is not rounded to 0. One factor after the other: the square of `down` may overflow.
-        let eps = eps * down.to_f64() * down.to_f64();
-        Standard { mean, scale: T::ONE / (variance + T::from_f64(eps)).sqrt(), down }
+    fn has_digits<T: Scalar>(x: &[T], scale: T) -> bool {
+        let least = T::from_f64(power_of_two(if size_of::<T>() == 4 { -102 } else { -970 }));
+        let largest = largest(x);
+        largest == T::ZERO || largest.minimum(largest * scale) >= least
     }
     let (mean, variance) = moments(x);
     let sum = variance + T::from_f64(eps);
-    if is_safe(sum) {
-        return (x, Standard { mean, scale: T::ONE / sum.sqrt(), down: T::ONE });
+    let scale = T::ONE / sum.sqrt();
+    let is_quick = is_safe(sum) && (is_safe(variance) || has_digits(x, scale));
+    is_quick.then_some(Standard { mean, scale })
+}
+
+/// Powers of two with which the layer normalisation of a row stays in range.
+#[doc(hidden)]
+pub struct RowUnits<T> {
+    /// Subtracted from the elements: what they are if they are equal, since these deviate by nothing. Otherwise 0.
+    pub first: T,
+    /// Multiplies the elements, whose squares are in range afterwards.
+    pub down: T,
+    /// The exponent of a power that multiplies deviations afterwards, which then are in units of `unit`.
+    pub rest: i64,
+    /// The exponent of the unit of `sqrt(variance + eps)`.
+    pub unit: i64,
+    /// Epsilon in units of the square.
+    pub eps: T,
+}
+
+impl<T: Scalar> RowUnits<T> {
+    /// The units of this row.
+    pub fn new(x: &[T], eps: f64) -> Self {
+        let equal = x.first().copied().filter(|&first| x.iter().all(|&x| x == first));
+        let [down, up] = powers(if equal.is_some() { T::from_f64(eps.sqrt()) } else { largest(x) });
+        let own = exponent(up);
+        let of_eps = if eps > 0.0 { exponent(eps.sqrt()) } else { own };
+        let unit = if equal.is_some() { of_eps } else { of_eps.max(own) };
+        // In f64, where epsilon is not rounded to 0. One factor after the other: the square of a power may overflow.
+        let eps = T::from_f64(eps * power_of_two(-unit) * power_of_two(-unit));
+        RowUnits { first: equal.unwrap_or(T::ZERO), down, rest: own - unit, unit, eps }
     }
-    let standard = scaled(x, eps, space);
-    (space, standard)
+}
+
+/// A row in units of a power of two, with factors that may be out of the range of the type.
+struct Scaled<T: Scalar> {
+    /// The deviations from the mean.
+    apart: Vec<T>,
+    /// What normalises them.
+    scale: T::Wide,
+    /// `1 / sqrt(variance + eps)` of the row itself.
+    slope: T::Wide,
+}
+
+impl<T: Scalar> Scaled<T> {
+    fn new(x: &[T], eps: f64) -> Self {
+        let RowUnits { first, down, rest, unit, eps } = RowUnits::new(x, eps);
+        let mut apart: Vec<T> = x.iter().map(|&x| (x - first) * down).collect();
+        let ([mean, low], variance) = moments(&apart);
+        apart.iter_mut().for_each(|x| *x = (*x - mean) - low);
+        let power = power_of_two(rest);
+        let sum = T::from_f64(variance.to_f64() * power * power) + eps;
+        let scale = (T::ONE / sum.sqrt()).wide();
+        Scaled { apart, scale: scale * wide_power::<T>(rest), slope: scale * wide_power::<T>(-unit) }
+    }
+}
+
+/// Layer normalisation of a row that [`standard`] leaves out.
+#[cold]
+#[inline(never)]
+fn scaled<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out: &mut [T]) {
+    let Scaled { apart, scale, .. } = Scaled::new(x, eps);
+    for i in 0..x.len() {
+        out[i] = (apart[i].wide() * scale * gain[i].wide()).narrow() + bias[i];
+    }
+}
+
+/// The gradient of a row where squares, deviations, `g gain` or their sums leave the range of the type. Shares of gain
+/// and bias are added to `group`, which may be empty.
+#[cold]
+#[inline(never)]
+fn scaled_grad<T: Scalar>(x: &[T], gain: &[T], g: &[T], eps: f64, dx: &mut [T], group: &mut [T]) {
+    let (n, Scaled { apart, scale, slope }) = (x.len(), Scaled::new(x, eps));
+    let (group_gain, group_bias) = group.split_at_mut(group.len() / 2);
+    for (i, (of_gain, of_bias)) in group_gain.iter_mut().zip(group_bias).enumerate() {
+        *of_gain += (g[i].wide() * apart[i].wide() * scale).narrow();
+        *of_bias += g[i];
+    }
+    // h = g gain in units of the largest one.
+    let top = (0..n).map(|i| exponent(g[i]) + exponent(gain[i])).fold(-20_000, i64::max);
+    let [down, up] = [-top, top].map(wide_power::<T>);
+    let unit: Vec<T> = apart.iter().map(|x| (x.wide() * scale).narrow()).collect();
+    for i in 0..n {
+        dx[i] = (g[i].wide() * gain[i].wide() * down).narrow();
+    }
+    let count = T::from_f64(n as f64);
+    let [level, along] = totals_of(dx, &unit, |h, u| [h, h * u]).map(|sum| sum / count);
+    for i in 0..n {
+        dx[i] = (((dx[i] - level) - unit[i] * along).wide() * slope * up).narrow();
+    }
+}
+
+/// Whether means of `h` and `h u` and all that they are computed from are in range, or there is no `g`.
+#[inline(always)]
+fn are_in_range<T: Scalar>(level: T, slope: T, g: &[T]) -> bool {
+    let [least, most] = if size_of::<T>() == 4 { [-90, 100] } else { [-900, 1000] };
+    let size = level.abs().maximum(slope.abs());
+    let is_within = size >= T::from_f64(power_of_two(least)) && size <= T::from_f64(power_of_two(most));
+    is_within || size == T::ZERO && largest(g) == T::ZERO
 }
 
 /// Layer normalisation of each row: `(x - mean) / sqrt(variance + eps) * gain + bias`, with the variance divided by
-/// `n`. It is right wherever the result is in range, whatever the squares.
+/// `n`. It is right wherever the result is in range, whatever the squares. So are its gradients.
 ///
 /// # Panics
 /// If `gain` and `bias` have different lengths, `x` is not whole rows of that length, or `out` is shorter than `x`.
@@ -125,14 +216,15 @@ pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out
         return;
     }
     blocks(&mut out[..x.len()], n, 0, &Pool::none(), &|_, start, out| {
-        let mut space = vec![];
         simd::dispatch(
             #[inline(always)]
             || {
                 let (gain, bias) = (&gain[..n], &bias[..n]);
                 for (x, out) in x[start..].chunks_exact(n).zip(out.chunks_exact_mut(n)) {
-                    let (x, Standard { mean: [mean, rest], scale, .. }) = standard(x, eps, &mut space);
-                    let x = &x[..n];
+                    let Some(Standard { mean: [mean, rest], scale }) = standard(x, eps) else {
+                        scaled(x, gain, bias, eps, out);
+                        continue;
+                    };
                     for i in 0..n {
                         out[i] = ((x[i] - mean) - rest) * scale * gain[i] + bias[i];
                     }
@@ -202,7 +294,7 @@ fn layer_norm_grad<T: Scalar>(
     scratch: &mut [T],
 ) {
     let n = gain.len();
-    let (count, mut space) = (T::from_f64(n as f64), vec![]);
+    let count = T::from_f64(n as f64);
     for ((x, g), dx) in x.chunks(GROUP * n).zip(g.chunks(GROUP * n)).zip(dx.chunks_mut(GROUP * n)) {
         simd::dispatch(
             #[inline(always)]
@@ -211,8 +303,10 @@ fn layer_norm_grad<T: Scalar>(
                 group.fill(T::ZERO);
                 let gain = &gain[..n];
                 for ((x, g), dx) in x.chunks_exact(n).zip(g.chunks_exact(n)).zip(dx.chunks_exact_mut(n)) {
-                    let (x, Standard { mean: [mean, rest], scale, down }) = standard(x, eps, &mut space);
-                    let x = &x[..n];
+                    let Some(Standard { mean: [mean, rest], scale }) = standard(x, eps) else {
+                        scaled_grad(x, gain, g, eps, dx, group);
+                        continue;
+                    };
                     for i in 0..n {
                         unit[i] = ((x[i] - mean) - rest) * scale;
                         dx[i] = g[i] * gain[i];
@@ -231,8 +325,12 @@ fn layer_norm_grad<T: Scalar>(
                         |h, u| [h, h * u],
                     );
                     let (level, slope) = (level / count, slope / count);
+                    if !are_in_range(level, slope, g) {
+                        scaled_grad(x, gain, g, eps, dx, &mut []);
+                        continue;
+                    }
                     for i in 0..n {
-                        dx[i] = ((dx[i] - level) - unit[i] * slope) * scale * down;
+                        dx[i] = ((dx[i] - level) - unit[i] * slope) * scale;
                     }
                 }
                 for (sum, &part) in sums.iter_mut().zip(&*group) {
