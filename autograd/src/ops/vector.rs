@@ -1,8 +1,8 @@
 //! Vectors along the last axis: cross product and normalisation.
 
 use crate::{Axes, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::scale::largest;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape};
+use raygrad_tensor::scale::{exponent, largest, power_of_two, wide_power};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, Wide, broadcast_shape};
 
 /// y = a x b along the last axis of extent 3, with broadcasting; da = b x g, db = g x a.
 #[derive(Clone, Copy)]
@@ -44,15 +44,21 @@ impl<T: Scalar> Op<T> for Cross {
 
 /// y = x / |x| along the last axis; dx = (g - y (y . g)) / |x|.
 ///
-/// Rows are divided by their largest element first, so that tiny and huge ones keep their digits. A row of zeros gives
+/// Rows are multiplied by a power of two first, so that tiny and huge ones keep their digits. A row of zeros gives
 /// zeros, with gradient 0. Where the gradient of a tiny row would overflow, it is the largest finite number.
 #[derive(Clone, Copy)]
 pub struct Normalize;
 
-/// The norm of `row / scale`, with the quotients written to `unit`.
-fn scaled_norm<T: Scalar>(row: &[T], scale: T, unit: &mut [T], squares: &mut [T]) -> T {
+/// A power of two that takes rows of this largest element close to 1; 0 for 0.
+fn scale<T: Scalar>(largest: T) -> T {
+    let most = if size_of::<T>() == 4 { 126 } else { 1022 };
+    if largest == T::ZERO { T::ZERO } else { T::from_f64(power_of_two((-exponent(largest)).clamp(-most, most))) }
+}
+
+/// The norm of `row * down`, with the products written to `unit`.
+fn scaled_norm<T: Scalar>(row: &[T], down: T, unit: &mut [T], squares: &mut [T]) -> T {
     for ((unit, square), &x) in unit.iter_mut().zip(squares.iter_mut()).zip(row) {
-        *unit = x / scale;
+        *unit = x * down;
         *square = *unit * *unit;
     }
     raygrad_tensor::sum(squares).sqrt()
@@ -60,28 +66,61 @@ fn scaled_norm<T: Scalar>(row: &[T], scale: T, unit: &mut [T], squares: &mut [T]
 
 /// The gradient of one row, in place of `g`.
 fn row_gradient<T: Scalar>(x: &[T], g: &mut [T], unit: &mut [T], products: &mut [T]) {
-    let scale = largest(x);
-    if scale == T::ZERO {
+    let largest = largest(x);
+    if largest == T::ZERO {
         g.fill(T::ZERO);
         return;
     }
-    let norm = scaled_norm(x, scale, unit, products);
-    for ((unit, product), &g) in unit.iter_mut().zip(products.iter_mut()).zip(g.iter()) {
-        *unit = *unit / norm;
-        *product = *unit * g;
+    let down = scale(largest);
+    let norm = scaled_norm(x, down, unit, products);
+    let mut least = T::ONE;
+    for (i, &g) in g.iter().enumerate() {
+        unit[i] = unit[i] / norm;
+        products[i] = unit[i] * g;
+        if unit[i].abs() < least && x[i] != T::ZERO {
+            least = unit[i].abs();
+        }
     }
     let along = raygrad_tensor::sum(products);
-    let most = T::from_f64(if size_of::<T>() == 4 { f32::MAX.into() } else { f64::MAX });
+    // The product of these numbers is in range, and so is each difference from one of them.
+    let [low, high] = if size_of::<T>() == 4 { [-60, 100] } else { [-500, 1000] }.map(power_of_two).map(T::from_f64);
+    let is_quick = along.abs() <= high && along.abs() >= low && least >= low || g.iter().all(|&g| g == T::ZERO);
+    if !is_quick {
+        return wide_row_gradient(x, g, down, norm, products);
+    }
     for (g, &unit) in g.iter_mut().zip(unit.iter()) {
-        let across = (*g - unit * along) / norm;
-        let quotient = across / scale;
-        *g = if quotient.is_finite() || !across.is_finite() {
-            quotient
-        } else if quotient > T::ZERO {
-            most
-        } else {
-            -most
-        };
+        let across = *g - unit * along;
+        *g = limited(across / norm * down, across);
+    }
+}
+
+/// `quotient`, or the largest number of its sign where it overflows although `across` does not.
+fn limited<T: Scalar>(quotient: T, across: T) -> T {
+    if quotient.is_finite() || !across.is_finite() {
+        return quotient;
+    }
+    T::from_f64(if size_of::<T>() == 4 { f32::MAX.into() } else { f64::MAX }) * quotient.sign()
+}
+
+/// [`row_gradient`] where a product leaves the range.
+#[cold]
+#[inline(never)]
+fn wide_row_gradient<T: Scalar>(x: &[T], g: &mut [T], down: T, norm: T, products: &mut [T]) {
+    let unit = |x: T| x.wide() * down.wide() / norm.wide();
+    // y . g in units of its largest term.
+    let term = |x: T, g: T| exponent(x) + exponent(down) - exponent(norm) + exponent(g);
+    let top = x.iter().zip(g.iter()).map(|(&x, &g)| term(x, g)).fold(-20_000, i64::max);
+    for (product, (&x, &g)) in products.iter_mut().zip(x.iter().zip(g.iter())) {
+        *product = (unit(x) * g.wide() * wide_power::<T>(-top)).narrow();
+    }
+    let sum = raygrad_tensor::sum(products);
+    let along = sum.wide() * wide_power::<T>(top);
+    for (g, &x) in g.iter_mut().zip(x) {
+        // The difference in units of the larger number.
+        let larger = exponent(*g).max(term(x, sum) + top);
+        let [small, large] = [-larger, larger].map(wide_power::<T>);
+        let across = (g.wide() * small).narrow() - (unit(x) * along * small).narrow();
+        *g = limited((across.wide() / norm.wide() * down.wide() * large).narrow(), across);
     }
 }
 
@@ -99,12 +138,12 @@ impl<T: Scalar> Op<T> for Normalize {
         let width = x[0].shape()[x[0].ndim() - 1].max(1);
         let mut squares = vec![T::ZERO; width];
         for (x, y) in x[0].as_slice().chunks_exact(width).zip(out.as_mut_slice().chunks_exact_mut(width)) {
-            let scale = largest(x);
-            if scale == T::ZERO {
+            let largest = largest(x);
+            if largest == T::ZERO {
                 y.fill(T::ZERO);
                 continue;
             }
-            let norm = scaled_norm(x, scale, y, &mut squares);
+            let norm = scaled_norm(x, scale(largest), y, &mut squares);
             y.iter_mut().for_each(|y| *y = *y / norm);
         }
         out
@@ -132,17 +171,15 @@ impl<T: Scalar> Op<T> for Normalize {
         let (tape, shape) = (x[0].tape(), x[0].shape());
         let mut column = Shape::from_slice(shape);
         let width = std::mem::replace(&mut column[shape.len() - 1], 1);
-        let scales: Vec<T> = match width {
+        let sizes: Vec<T> = match width {
             0 => vec![T::ONE; column.iter().product()],
             _ => x[0].value().as_slice().chunks_exact(width).map(largest).collect(),
         };
-        // The scale of a row cancels, so it is a constant. A row of zeros is divided by infinity: 0 with gradient 0.
-        let zero = |&scale: &T| scale == T::ZERO;
-        let scale = |scale| if zero(scale) { T::from_f64(f64::INFINITY) } else { *scale };
-        let scale = tape.constant(Tensor::from_vec(&column, scales.iter().map(scale).collect()));
-        let one = |scale| if zero(scale) { T::ONE } else { T::ZERO };
-        let one = tape.constant(Tensor::from_vec(&column, scales.iter().map(one).collect()));
-        let unit = &x[0] / scale;
+        // The scale of a row cancels, so it is a constant. A row of zeros has scale 0, so that its gradient is 0.
+        let of_sizes = |f: &dyn Fn(T) -> T| tape.constant(Tensor::from_fn(&column, |i| f(sizes[i])));
+        let down = of_sizes(&scale);
+        let one = of_sizes(&|size| if size == T::ZERO { T::ONE } else { T::ZERO });
+        let unit = &x[0] * down;
         let square = unit.square().sum_over(Axes::from(-1).keepdims());
         Some(unit / (square + one).sqrt())
     }
@@ -166,7 +203,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f32>::new();
-    /// let x = tape.leaf(Tensor::from([[3e-23, 4e-23], [0.0, 0.0]]));
+    /// let tiny = 2.0_f32.powi(-100); // its square is 0
+    /// let x = tape.leaf(Tensor::from([[3.0 * tiny, 4.0 * tiny], [0.0, 0.0]]));
     /// assert_eq!(x.normalize().value(), [[0.6, 0.8], [0.0, 0.0]]);
     /// ```
     ///

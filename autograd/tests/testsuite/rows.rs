@@ -1,4 +1,4 @@
-//! Softmax and its relatives and layer normalisation of rows of all bits, against 100-bit arithmetic.
+//! Softmax and its relatives, layer normalisation and normalisation of rows of all bits, against 100-bit arithmetic.
 //! Values and gradients are compared one by one; where terms cancel, in units of the largest one.
 
 use crate::accuracy::exact::Exact;
@@ -229,6 +229,35 @@ fn layer_norms<T: Scalar>() {
     }
 }
 
+fn normalizes<T: Scalar>() {
+    for case in 0..2 * ROWS {
+        let random = &mut Random::of("normalize", case);
+        let n = 1 + random.below(7) as usize;
+        let (x, (g, is_ordinary)) = (row::<T>(random, n), factors::<T>(random, n));
+        let (wide_x, wide_g) = (exacts(&x), exacts(&g));
+        let length = sum(wide_x.iter().map(|x| x.square())).sqrt();
+        if length.is_zero() {
+            continue;
+        }
+        let [y, plain, recorded] = evaluate::<T>(&[&x], &g, |x| x[0].normalize());
+        let u: Vec<_> = wide_x.iter().map(|&x| x / length).collect();
+        check::<T>("normalize", &x, &y[0], &u.iter().map(|&u| [u, Exact::ZERO]).collect::<Vec<_>>(), 8.0);
+        let terms: Vec<_> = u.iter().zip(&wide_g).map(|(&u, &g)| u * g).collect();
+        let (along, term) = (sum(terms.iter().copied()), largest(terms));
+        let exact = |i| [(wide_g[i] - u[i] * along) / length, largest([wide_g[i], u[i] * term]) / length];
+        let dx: Vec<_> = (0..n).map(exact).collect();
+        // Beyond, it is the largest number, not infinity.
+        let limit = Exact::new(1.0).shifted(Format::of::<T>().greatest);
+        let is_in_range = dx.iter().all(|dx| dx[0].abs() < limit);
+        let is_even = u.iter().all(|u| u.is_zero() || u.exponent() > -40);
+        for (which, grads) in [("gradient", plain), ("recorded gradient", recorded)] {
+            if is_in_range && (which == "gradient" || is_ordinary && is_even) {
+                check::<T>(&format!("{which} of normalize for {g:?}"), &x, &grads[0], &dx, 12.0);
+            }
+        }
+    }
+}
+
 #[test]
 fn softmax_and_its_relatives_of_all_bits() {
     softmaxes::<f32>();
@@ -239,4 +268,10 @@ fn softmax_and_its_relatives_of_all_bits() {
 fn layer_norm_of_all_bits() {
     layer_norms::<f32>();
     layer_norms::<f64>();
+}
+
+#[test]
+fn normalize_of_all_bits() {
+    normalizes::<f32>();
+    normalizes::<f64>();
 }
