@@ -73,24 +73,27 @@ fn row_gradient<T: Scalar>(x: &[T], g: &mut [T], unit: &mut [T], products: &mut 
     }
     let down = scale(largest);
     let norm = scaled_norm(x, down, unit, products);
-    let mut least = T::ONE;
-    for (i, &g) in g.iter().enumerate() {
-        unit[i] = unit[i] / norm;
-        products[i] = unit[i] * g;
-        if unit[i].abs() < least && x[i] != T::ZERO {
-            least = unit[i].abs();
-        }
+    let (mut least, mut size, mut has_terms) = (T::ONE, T::ZERO, false);
+    for (((unit, product), &x), &g) in unit.iter_mut().zip(products.iter_mut()).zip(x).zip(g.iter()) {
+        *unit = *unit / norm;
+        *product = *unit * g;
+        least = if x != T::ZERO && unit.abs() < least { unit.abs() } else { least };
+        size = if product.abs() > size { product.abs() } else { size };
+        has_terms |= x != T::ZERO && g != T::ZERO;
     }
     let along = raygrad_tensor::sum(products);
-    // The product of these numbers is in range, and so is each difference from one of them.
-    let [low, high] = if size_of::<T>() == 4 { [-60, 100] } else { [-500, 1000] }.map(power_of_two).map(T::from_f64);
-    let is_quick = along.abs() <= high && along.abs() >= low && least >= low || g.iter().all(|&g| g == T::ZERO);
-    if !is_quick {
+    // Products of an element of the unit vector and of `along`, in units of its largest term, are in range.
+    let [low, high, normal] = if size_of::<T>() == 4 { [-100, 100, -126] } else { [-900, 1000, -1022] }
+        .map(|exponent| T::from_f64(power_of_two(exponent)));
+    let inverse = down / norm;
+    let is_inverse = inverse >= normal && inverse.is_finite();
+    let is_term = least >= normal && least * size >= low && size <= high;
+    if !(is_inverse && (is_term || !has_terms)) {
         return wide_row_gradient(x, g, down, norm, products);
     }
     for (g, &unit) in g.iter_mut().zip(unit.iter()) {
         let across = *g - unit * along;
-        *g = limited(across / norm * down, across);
+        *g = limited(across * inverse, across);
     }
 }
 

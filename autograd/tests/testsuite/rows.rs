@@ -23,10 +23,11 @@ fn of_size<T: Scalar>(random: &mut Random, least: i64, count: i64) -> f64 {
     random.of_exponent::<T>(exponent.max(Format::of::<T>().least))
 }
 
-/// Rows of all bits, of one size or of many, close to the subnormal numbers, of neighbours, and of equal numbers.
+/// Rows of all bits, of one size or of many, close to the subnormal numbers, of neighbours, of equal numbers, and of
+/// ordinary numbers among zeros.
 fn row<T: Scalar>(random: &mut Random, n: usize) -> Vec<f64> {
     let Format { least, greatest, digits } = Format::of::<T>();
-    let (kind, size, first) = (random.below(8), least + random.below(greatest - least), random.pattern::<T>());
+    let (kind, size, first) = (random.below(9), least + random.below(greatest - least), random.pattern::<T>());
     rounded::<T>(many(n, || match kind {
         0 => random.pattern::<T>(),
         1 => of_size::<T>(random, size - 2, 3),
@@ -35,6 +36,7 @@ fn row<T: Scalar>(random: &mut Random, n: usize) -> Vec<f64> {
         4 => first * (1.0 + random.below(16) as f64 * 2.0_f64.powi(-digits as i32)),
         5 => first,
         6 => of_size::<T>(random, greatest - 2, 3),
+        7 if random.below(2) == 0 => 0.0,
         _ => of_size::<T>(random, -3, 5),
     }))
 }

@@ -193,13 +193,13 @@ fn scaled_grad<T: Scalar>(x: &[T], gain: &[T], g: &[T], eps: f64, dx: &mut [T], 
     }
 }
 
-/// Whether means of `h` and `h u` and all that they are computed from are in range, or there is no `g`.
+/// Whether means of `h` and `h u` and all that they are computed from are in range, or `g` or `gain` is 0.
 #[inline(always)]
-fn are_in_range<T: Scalar>(level: T, slope: T, g: &[T]) -> bool {
+fn are_in_range<T: Scalar>(level: T, slope: T, gain: &[T], g: &[T]) -> bool {
     let [least, most] = if size_of::<T>() == 4 { [-90, 100] } else { [-900, 1000] };
     let size = level.abs().maximum(slope.abs());
     let is_within = size >= T::from_f64(power_of_two(least)) && size <= T::from_f64(power_of_two(most));
-    is_within || size == T::ZERO && largest(g) == T::ZERO
+    is_within || size == T::ZERO && (largest(g) == T::ZERO || largest(gain) == T::ZERO)
 }
 
 /// Layer normalisation of each row: `(x - mean) / sqrt(variance + eps) * gain + bias`, with the variance divided by
@@ -325,7 +325,7 @@ fn layer_norm_grad<T: Scalar>(
                         |h, u| [h, h * u],
                     );
                     let (level, slope) = (level / count, slope / count);
-                    if !are_in_range(level, slope, g) {
+                    if !are_in_range(level, slope, gain, g) {
                         scaled_grad(x, gain, g, eps, dx, &mut []);
                         continue;
                     }

@@ -39,6 +39,7 @@ fn exponentials<T: Scalar>(x: &mut [T]) {
 
 /// `power`, which is `e^(x - shift)`, with the rounding error of the difference (Knuth's two-sum). Without it, a power is
 /// off by as many units as its exponent is large.
+#[doc(hidden)]
 #[inline(always)]
 pub fn corrected<T: Scalar>(power: T, x: T, shift: T) -> T {
     let difference = x - shift;

@@ -104,20 +104,31 @@ impl<T: Scalar> Ema<T> {
     }
 }
 
+/// Elements between two looks for numbers that are not finite.
+const BLOCK: usize = 1024;
+
 /// The weighted mean of `a` and `x`, where `share` is the weight of `x` if the average is slow, else of `a`.
+#[inline(always)]
+fn mean<T: Scalar, const SLOW: bool>(a: T, x: T, share: T) -> T {
+    let [near, far] = if SLOW { [a, x] } else { [x, a] };
+    flushed(near + (share * far - share * near))
+}
+
+/// Replaces `a` by its [mean] with `x`. Elements of `x` that are not finite are skipped and counted.
 fn blend<T: Scalar, const SLOW: bool>(a: &mut [T], x: &[T], share: T) -> usize {
-    let n = a.len();
-    let x = &x[..n];
     simd::dispatch(
         #[inline(always)]
         || {
             let mut skipped = 0;
-            for i in 0..n {
-                let good = x[i].is_finite();
-                let [near, far] = if SLOW { [a[i], x[i]] } else { [x[i], a[i]] };
-                let blended = flushed(near + (share * far - share * near));
-                a[i] = if good { blended } else { a[i] };
-                skipped += usize::from(!good);
+            for (a, x) in a.chunks_mut(BLOCK).zip(x.chunks(BLOCK)) {
+                // Without a choice for each element, the loop is vectorised.
+                if x.iter().fold(true, |all, x| all & x.is_finite()) {
+                    a.iter_mut().zip(x).for_each(|(a, &x)| *a = mean::<T, SLOW>(*a, x, share));
+                    continue;
+                }
+                for (a, &x) in a.iter_mut().zip(x) {
+                    if x.is_finite() { *a = mean::<T, SLOW>(*a, x, share) } else { skipped += 1 }
+                }
             }
             skipped
         },
