@@ -595,7 +595,7 @@ fn images_beyond_the_free_memory_are_an_error() {
     // .4 TB.
     place.fails(
         "train . --downscale 1 --steps 1 --out run",
-        &["transforms.json: 500 images need 402.7 GB of memory, but ", " GB are free: a downscale of "],
+        &["transforms.json: 500 images need 403.5 GB of memory, but ", " GB are free: a downscale of "],
     );
     assert!(!place.path("run").exists());
 }
