@@ -158,6 +158,7 @@ fn an_image_has_one_pose() {
     };
     assert_eq!(good(twice(4.0)).views.len(), 3);
     assert_eq!(good(twice(4.0 + 1e-9)).views.len(), 3, "rounded");
+    fails(twice(4.0001), &["`frames[2]`: has another pose"]);
     fails(twice(5.0), &["`frames[2]`: has another pose for the image of frames[0], `images/0.png`: remove one"]);
 }
 
