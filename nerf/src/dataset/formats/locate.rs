@@ -135,33 +135,6 @@ pub(super) fn folders(root: &Path, names: &[&str]) -> Vec<PathBuf> {
     found.into_iter().map(|(.., path)| path).collect()
 }
 
-/// The fullest of `others` and a note, if `folder` is a stale copy of it: with less than half of the files of these
-/// names, each as long as in the other. Files of other lengths may be other images, such as undistorted ones.
-pub(super) fn fuller(
-    root: &Path,
-    folder: &Path,
-    others: impl Iterator<Item = PathBuf>,
-    names: &[&str],
-) -> Option<(PathBuf, String)> {
-    let length = |path: PathBuf| path.metadata().ok().filter(|about| about.is_file()).map(|about| about.len());
-    let lengths = |folder: &Path| names.iter().map(|name| length(folder.join(name))).collect::<Vec<_>>();
-    let own = lengths(folder);
-    let held = own.iter().flatten().count();
-    if 2 * held >= names.len() {
-        return None;
-    }
-    let rated = others.filter_map(|other| {
-        let lengths = lengths(&other);
-        let count = lengths.iter().flatten().count();
-        let is_copied = own.iter().zip(&lengths).all(|(own, other)| own.is_none() || own == other);
-        (is_copied && count > held).then_some((count, other))
-    });
-    let (count, other) = rated.reduce(|best, next| if next.0 > best.0 { next } else { best })?;
-    let [from, to] = [folder, &other].map(|path| shown(path.strip_prefix(root).unwrap_or(path)));
-    let total = names.len();
-    Some((other, format!("`{from}` holds {held} of {total} files: used `{to}`, which holds {count}")))
-}
-
 /// A path below a folder, which is `.` itself.
 pub(super) fn shown(inside: &Path) -> String {
     if inside.as_os_str().is_empty() { ".".to_owned() } else { inside.display().to_string() }

@@ -1,6 +1,6 @@
 //! The images and masks of a model.
 
-use super::super::locate::{IMAGES, fuller, locate};
+use super::super::locate::{IMAGES, locate, shown};
 use crate::dataset::capture::Capture;
 use crate::dataset::formats::masks;
 use crate::error::{Error, Result};
@@ -42,6 +42,33 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     capture.views.iter_mut().zip(found).for_each(|(view, image)| view.image = image.map(|image| image.path));
     masks::attach(capture, &[root]);
     Ok(())
+}
+
+/// The fullest of `others` and a note, if `folder` is a stale copy of it: with less than half of the files of these
+/// names, each as long as in the other. Files of other lengths may be other images, such as undistorted ones.
+fn fuller(
+    root: &Path,
+    folder: &Path,
+    others: impl Iterator<Item = PathBuf>,
+    names: &[&str],
+) -> Option<(PathBuf, String)> {
+    let length = |path: PathBuf| path.metadata().ok().filter(|about| about.is_file()).map(|about| about.len());
+    let lengths = |folder: &Path| names.iter().map(|name| length(folder.join(name))).collect::<Vec<_>>();
+    let own = lengths(folder);
+    let held = own.iter().flatten().count();
+    if 2 * held >= names.len() {
+        return None;
+    }
+    let rated = others.filter_map(|other| {
+        let lengths = lengths(&other);
+        let count = lengths.iter().flatten().count();
+        let is_copied = own.iter().zip(&lengths).all(|(own, other)| own.is_none() || own == other);
+        (is_copied && count > held).then_some((count, other))
+    });
+    let (count, other) = rated.reduce(|best, next| if next.0 > best.0 { next } else { best })?;
+    let [from, to] = [folder, &other].map(|path| shown(path.strip_prefix(root).unwrap_or(path)));
+    let total = names.len();
+    Some((other, format!("`{from}` holds {held} of {total} files: used `{to}`, which holds {count}")))
 }
 
 /// The folder of the capture of a model: that of `sparse` for the model `sparse/0`, or the one around it if that is
