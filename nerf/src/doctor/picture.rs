@@ -6,7 +6,9 @@ use crate::dataset::{Image, Photo};
 /// Half of the width of a patch, in pixels.
 pub(super) const HALF: i32 = 3;
 /// Pixels in a patch.
-pub(super) const PATCH: usize = (2 * HALF as usize + 1).pow(2);
+pub(super) const PATCH: usize = SIDE * SIDE;
+/// The width of a patch, in pixels.
+const SIDE: usize = 2 * HALF as usize + 1;
 /// The side of the squares that give at most one patch each.
 const CELL: usize = 16;
 /// The most patches of an image.
@@ -50,7 +52,9 @@ impl Picture {
                 let [x, y] = [(i % width) as f64 + 0.5, (i / width) as f64 + 0.5];
                 let direction = glam::DVec3::new((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], 1.0);
                 let place = lens.place(direction);
-                place.map_or(f32::NAN, |[x, y]| picture.at(x * focal[0] + centre[0], y * focal[1] + centre[1]))
+                place.map_or(f32::NAN, |[x, y]| {
+                    picture.at((x * focal[0] + centre[0]) as f32, (y * focal[1] + centre[1]) as f32)
+                })
             });
             picture.values = pixels.collect();
         }
@@ -60,12 +64,13 @@ impl Picture {
 
     /// The value at a place, between pixels; NaN outside.
     #[inline(always)]
-    pub fn at(&self, x: f64, y: f64) -> f32 {
-        let [x, y] = [(x - 0.5) as f32, (y - 0.5) as f32];
+    pub fn at(&self, x: f32, y: f32) -> f32 {
+        let [x, y] = [x - 0.5, y - 0.5];
         if !(x >= 0.0 && y >= 0.0 && x < (self.width - 1) as f32 && y < (self.height - 1) as f32) {
             return f32::NAN;
         }
-        let (column, row) = (x as usize, y as usize);
+        // The conversion to i32 is one instruction.
+        let (column, row) = (x as i32 as usize, y as i32 as usize);
         let (s, t) = (x - column as f32, y - row as f32);
         let start = row * self.width + column;
         let [a, b] = [self.values[start], self.values[start + 1]];
@@ -76,14 +81,16 @@ impl Picture {
 
     /// The patch around a place whose columns and rows step by these vectors; `None` where something is not known or
     /// there is no contrast.
-    pub fn patch(&self, [x, y]: [f64; 2], [across, down]: [[f64; 2]; 2]) -> Option<Patch> {
+    pub fn patch(&self, place: [f64; 2], [across, down]: [[f64; 2]; 2]) -> Option<Patch> {
+        let [[x, y], across, down] = [place, across, down].map(|vector| vector.map(|x| x as f32));
         let mut patch = [0.0; PATCH];
         let mut sum = 0.0;
-        for (i, value) in patch.iter_mut().enumerate() {
-            let side = 2 * HALF as usize + 1;
-            let [u, v] = [(i % side) as f64 - f64::from(HALF), (i / side) as f64 - f64::from(HALF)];
-            *value = self.at(x + u * across[0] + v * down[0], y + u * across[1] + v * down[1]);
-            sum += *value;
+        for (row, v) in patch.chunks_exact_mut(SIDE).zip(-HALF..) {
+            let [x, y] = [x + v as f32 * down[0], y + v as f32 * down[1]];
+            for (value, u) in row.iter_mut().zip(-HALF..) {
+                *value = self.at(x + u as f32 * across[0], y + u as f32 * across[1]);
+                sum += *value;
+            }
         }
         // One NaN makes the sum NaN.
         let mean = sum / PATCH as f32;
