@@ -179,7 +179,7 @@ fn learned_scene_has_true_colour_depth_and_normals() {
     field.grid = HashGridConfig { levels: 4, features: 2, log2_table: 14, coarsest: 8, finest: 40 };
     (field.density_width, field.color_width) = (16, 16);
     let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
-    (sampler.step, sampler.view_step, sampler.samples, sampler.occupancy.resolution) = (0.02, 0.005, 8192, 32);
+    (sampler.step, sampler.view_step, sampler.samples, sampler.occupancy.resolution) = (0.02, 0.005, 4096, 32);
     let mut trainer = Trainer::new(config, Arc::new(data)).unwrap();
     for i in 0..500 {
         trainer.step(f64::from(i) / 500.0);

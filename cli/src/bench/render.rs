@@ -57,7 +57,7 @@ pub fn run(quick: bool, folder: Option<&Path>) -> Result<Results> {
     };
     let (model, views) = match folder {
         Some(folder) => stored(folder, &scale)?,
-        None => trained(&scale)?,
+        None => trained(Config::preset(Preset::Instant), &scale)?,
     };
     let Some(sampler) = model.marching() else {
         return Err(Error::setting(
@@ -86,10 +86,10 @@ pub fn run(quick: bool, folder: Option<&Path>) -> Result<Results> {
 }
 
 /// A model of the built-in scene after a few training steps, with the occupancy grid of training.
-fn trained(scale: &Scale) -> Result<(Model<f32>, Dataset)> {
+fn trained(config: Config, scale: &Scale) -> Result<(Model<f32>, Dataset)> {
     note(&format!("render: training for {} steps", scale.steps));
     let data = Arc::new(embedded(Split::Train, scale.size));
-    let mut trainer = Trainer::new(Config::preset(Preset::Instant), data)?;
+    let mut trainer = Trainer::new(config, data)?;
     for step in 0..scale.steps {
         trainer.step(step as f64 / scale.steps as f64);
     }
@@ -324,8 +324,9 @@ fn findings(outcomes: &[Outcome], pixels: f64, apart: f64) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use raygrad::nerf::RayTolerance;
+    use raygrad::nerf::sampling::marching::MarchingConfig;
     use raygrad::nerf::space::occupancy::Skip;
+    use raygrad::nerf::{InstantConfig, RayTolerance};
 
     #[test]
     fn mark_dominated_on_work_and_psnr() {
@@ -361,8 +362,12 @@ mod tests {
     /// Limits counts and errors. Times are too noisy for limits.
     #[test]
     fn sweep_small_is_within_limits() {
-        let scale = Scale { steps: 60, size: 32, views: 1, rounds: 1 };
-        let (model, views) = trained(&scale).unwrap();
+        let scale = Scale { steps: 60, size: 16, views: 1, rounds: 1 };
+        let mut config = Config::preset(Preset::Instant);
+        config.field.get_mut::<InstantConfig>().unwrap().grid.log2_table = 14;
+        let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
+        (sampler.samples, sampler.occupancy.resolution) = (16384, 32);
+        let (model, views) = trained(config, &scale).unwrap();
         let Reference { images: reference, apart } = references(&model, &views).unwrap();
         assert!(apart > 60.0 && apart < PERFECT, "the rules agree where steps are short: {apart} dB");
         let step = 1.0 / 600.0;

@@ -305,9 +305,10 @@ fn tiny_table() -> Config {
     let mut config = Config::preset(Preset::Instant);
     if let Some(field) = config.field.get_mut::<InstantConfig>() {
         field.grid = HashGridConfig { levels: 3, features: 2, log2_table: 8, coarsest: 4, finest: 16 };
+        (field.density_width, field.color_width) = (16, 16);
     }
     if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
-        (sampler.step, sampler.samples, sampler.occupancy.resolution) = (0.04, 2048, 16);
+        (sampler.step, sampler.samples, sampler.occupancy.resolution) = (0.04, 1024, 16);
     }
     config
 }
