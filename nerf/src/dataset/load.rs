@@ -28,6 +28,10 @@ const HELD_OUT: usize = 8;
 const LOOKED_AT: usize = 3;
 /// The transparent share of an image from which its background counts as empty.
 const CLEAR: f64 = 0.05;
+/// The least alpha of an opaque pixel: 8-bit rounding may leave 254 of 255.
+const OPAQUE: f32 = 0.99;
+/// The reason of a bounded scene whose images have no transparency.
+pub(crate) const BEFORE_WHITE: &str = "images show an object before white";
 /// The white share of the border from which an image shows an object in front of white.
 const WHITE_BORDER: f64 = 0.98;
 /// The largest downscale factor that is suggested.
@@ -202,7 +206,10 @@ impl Capture {
             found = of(other);
         }
         if found.is_empty() {
-            return Err(Error::file(&self.file, format!("has no {split} images")));
+            let first = self.views.first().filter(|_| self.present().next().is_none());
+            let why =
+                first.map_or(String::new(), |view| format!(": none of its images exists, such as `{}`", view.name));
+            return Err(Error::file(&self.file, format!("has no {split} images{why}")));
         }
         Ok(found)
     }
@@ -211,29 +218,48 @@ impl Capture {
     /// type.
     ///
     /// # Errors
-    /// If an image with an alpha channel cannot be read, or as [`SceneAnalysis::new`].
+    /// If an image with an alpha channel cannot be read, if all have one alpha below 1 or 12 bits in 16, or as
+    /// [`SceneAnalysis::new`].
     pub fn analyze_scene(&self, asked: Option<SceneType>) -> Result<SceneAnalysis> {
         let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
         let ([mut clear, mut white, mut alpha], total) = ([0; 3], looked_at.len());
+        let (mut faint, mut low) = (vec![], vec![]);
         for view in looked_at {
             let Some(path) = &view.image else { continue };
             let name = |error| Error::field(&self.file, &view.field, error);
             let has_alpha = Photo::file_has_alpha(path).map_err(name)?;
             match Photo::open(path, None) {
                 Ok(photo) => {
+                    let (least, most) = photo.alpha_range();
+                    faint.extend((least == most && most < OPAQUE).then_some((view, most)));
+                    low.extend(photo.unscaled_bits().map(|most| (view, most)));
                     // A transparent border may be left by undistortion, so it is no sign of an empty background.
                     clear += usize::from(photo.transparent_share() > CLEAR);
-                    alpha += usize::from(photo.pixels().any(|pixel| pixel[3] < 1.0));
-                    white += usize::from(!has_alpha && photo.white_border() > WHITE_BORDER);
+                    alpha += usize::from(least < 1.0);
+                    white += usize::from(least >= OPAQUE && photo.white_border() > WHITE_BORDER);
                 }
                 Err(error) if has_alpha => return Err(name(error)),
                 // Loading reports the error.
                 Err(_) => {}
             }
         }
+        if let Some((view, most)) = faint.first().filter(|_| faint.len() == total) {
+            let what = format!(
+                "has alpha {most} in every pixel, and others have one value too: remove the alpha channel, or make the \
+                 object opaque in it"
+            );
+            return Err(Error::field(&self.file, &view.field, what));
+        }
+        if let Some((view, most)) = low.first().filter(|_| low.len() == total) {
+            let what = format!(
+                "has 16 bits per channel, but no value above {most} of 65535, as others: multiply images of 8, 10 or 12 \
+                 bits by 257, 64 or 16"
+            );
+            return Err(Error::field(&self.file, &view.field, what));
+        }
         let empty = match (2 * clear > total, white == total) {
             (true, _) => Some("images have a transparent background"),
-            (_, true) => Some("images show an object before white"),
+            (_, true) => Some(BEFORE_WHITE),
             // An object may fill most of the image. Blender writes an alpha channel without one, too.
             _ if 2 * alpha > total && self.format == Format::Blender => Some("images have transparent pixels"),
             _ => None,

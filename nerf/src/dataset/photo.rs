@@ -177,6 +177,20 @@ impl Photo {
         if self.has_alpha() { clear.count() as f64 / (self.width * self.height).max(1) as f64 } else { 0.0 }
     }
 
+    /// The least and the largest alpha, 0 to 1; 1 without an alpha channel.
+    pub(super) fn alpha_range(&self) -> (f32, f32) {
+        let alphas = self.pixels().map(|pixel| pixel[3]);
+        let range = |(least, most): (f32, f32), alpha: f32| (least.min(alpha), most.max(alpha));
+        if self.has_alpha() { alphas.fold((1.0, 0.0), range) } else { (1.0, 1.0) }
+    }
+
+    /// The largest value of a 16-bit image whose colours need 12 bits or fewer, unless it is black.
+    pub(super) fn unscaled_bits(&self) -> Option<u16> {
+        let Values::Words(values) = &self.values else { return None };
+        let most = values.chunks_exact(self.channels).flat_map(|pixel| &pixel[..3]).max()?;
+        (1..1 << 12).contains(most).then_some(*most)
+    }
+
     /// The share of the one-pixel border that is white, up to JPEG errors: 0 to 1.
     pub(super) fn white_border(&self) -> f64 {
         /// The least value of a white channel.

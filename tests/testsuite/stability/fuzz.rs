@@ -23,7 +23,8 @@ use std::sync::Arc;
 /// A dataset of two images of 4 x 4 pixels.
 fn scene(folder: &Path) -> Vec<u8> {
     for i in 0..2 {
-        let image = Image { width: 4, height: 4, channels: 4, data: vec![0.25 * (i + 1) as f32; 64] };
+        let data = (0..64).map(|k| (k / 4 + 16 * i) as f32 / 32.0).collect();
+        let image = Image { width: 4, height: 4, channels: 4, data };
         std::fs::write(folder.join(format!("r_{i}.png")), image.to_png()).unwrap();
     }
     let text = r#"{ "camera_angle_x": 0.6911112070083618, "frames": [

@@ -402,6 +402,33 @@ fn masks_as_alpha_cut_out_the_object() {
 }
 
 #[test]
+fn alpha_and_bits_that_say_nothing_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 9);
+    capture.split_by_default();
+    let analyze = |pixel: &dyn Fn(usize) -> [u16; 4]| {
+        let values: Vec<u16> = (0..12 * 8).flat_map(pixel).collect();
+        let image = image::ImageBuffer::<image::Rgba<u16>, _>::from_raw(12, 8, values).unwrap();
+        capture.present().for_each(|view| image.save(view.image.as_ref().unwrap()).unwrap());
+        capture.analyze_scene(None).map(|analysis| analysis.scene_type).map_err(|error| error.to_string())
+    };
+    let whole = u16::MAX;
+    for alpha in [0, whole / 2] {
+        let message = analyze(&|i| [9 * i as u16, 9000, 50000, alpha]).unwrap_err();
+        assert!(message.contains("in every pixel") && message.contains("remove the alpha channel"), "{message}");
+    }
+    for bits in [8, 10, 12] {
+        let message = analyze(&|_| [(1 << bits) - 1, 3, 1, whole]).unwrap_err();
+        assert!(message.contains(&format!("no value above {} of 65535", (1 << bits) - 1)), "{message}");
+    }
+    let opaque = |i: usize| [9 * i as u16, 9000, 50000, 65279];
+    assert_eq!(analyze(&opaque).unwrap(), SceneType::Unbounded, "254 of 255 is a rounding error");
+    assert_eq!(analyze(&|i| [5000, 0, 0, if i < 40 { 0 } else { whole / 2 }]).unwrap(), SceneType::Bounded);
+    assert_eq!(analyze(&|_| [0, 0, 0, whole]).unwrap(), SceneType::Unbounded, "black images have no bits");
+    assert_eq!(analyze(&|_| [whole; 4]).unwrap(), SceneType::Bounded, "opaque alpha changes nothing of white");
+}
+
+#[test]
 fn object_in_front_of_white_is_bounded() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
