@@ -323,6 +323,13 @@ fn doctor_finds_useless_masks_and_alpha() {
     found(&report, Kind::MaskHidesNothing, Note, &[4], &[Kind::MaskHidesAll]);
 
     let planted = Planted::new();
+    planted.redraw(3, |image| image.over([1.0; 3]));
+    found(&planted.cameras(), Kind::NoAlpha, Warning, &[3], &[]);
+    (0..48).for_each(|view| planted.redraw(view, |image| image.over([1.0; 3])));
+    planted.redraw(3, |image| image.clone());
+    assert!(planted.cameras().finds(Kind::NoAlpha).is_none(), "a white background");
+
+    let planted = Planted::new();
     let opaque = |image: &Image| {
         let data = image.data.chunks_exact(4).flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], 1.0]).collect();
         Image { data, ..*image }

@@ -189,6 +189,11 @@ kinds! {
     MaskHidesNothing = "mask-hides-nothing", Note,
         "the masks of {} hide no pixel",
         "Nothing to do if nothing should be hidden.";
+    /// Images have no alpha channel, unlike most others.
+    NoAlpha = "no-alpha", Warning,
+        "{} have no alpha channel, unlike most others",
+        "Save these with a transparent background as the others are, or training learns their background as part of \
+         the scene.";
     /// Images have an alpha channel that is opaque everywhere.
     OpaqueAlpha = "opaque-alpha", Note,
         "the alpha channel of {} is opaque everywhere",

@@ -77,6 +77,7 @@ fn without_pixels(capture: &Capture, analysis: Option<&SceneAnalysis>, findings:
     }
     single::examine(capture, findings);
     layout::examine(capture, analysis, findings);
+    pixels::without_alpha(capture, analysis, findings);
     let resolutions = pixels::sizes(capture, findings)
         .into_iter()
         .map(|([width, height], images)| Resolution { width, height, images })

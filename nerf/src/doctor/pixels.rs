@@ -3,8 +3,8 @@
 use super::kinds::{FindingKind as Kind, Severity};
 use super::look::Look;
 use super::report::Findings;
-use crate::dataset::load::{mask_fits, same_shape};
-use crate::dataset::{Capture, Photo, Split, View};
+use crate::dataset::load::{BEFORE_WHITE, mask_fits, same_shape};
+use crate::dataset::{Capture, Photo, SceneAnalysis, SceneType, Split, View};
 use crate::error::Result;
 use crate::numbers::{median, spread};
 use std::collections::{HashMap, HashSet};
@@ -59,6 +59,22 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
         findings.add(Kind::MixedResolutions, &[&listed.join(", ")]);
     }
     counts
+}
+
+/// Adds a finding about images without an alpha channel among those that show an object on a transparent background.
+pub(super) fn without_alpha(capture: &Capture, analysis: Option<&SceneAnalysis>, findings: &mut Findings) {
+    let is_cut = |analysis: &&SceneAnalysis| {
+        analysis.scene_type == SceneType::Bounded && !analysis.reason.starts_with(BEFORE_WHITE)
+    };
+    if analysis.filter(is_cut).is_none() {
+        return;
+    }
+    let has_alpha = |view: &View| Photo::file_has_alpha(view.image.as_ref()?).ok();
+    let (with, without): (Vec<_>, Vec<_>) =
+        capture.present().filter_map(|view| Some((view, has_alpha(view)?))).partition(|(_, has_alpha)| *has_alpha);
+    if without.len() < with.len() {
+        findings.about(Kind::NoAlpha, without.into_iter().map(|(view, _)| view), &[]);
+    }
 }
 
 /// Adds a finding about images that cannot be decoded.
