@@ -16,6 +16,9 @@ use std::path::{Path, PathBuf};
 /// The relative difference of equal poses.
 const SAME_POSE: f64 = 1e-6;
 
+/// The relative difference of focal lengths of one camera, as shares of the longer side.
+const SAME_CAMERA: f64 = 0.02;
+
 /// The unit of integer depth images in nerfstudio: a millimetre in scenes in metres.
 const DEPTH_UNIT: f64 = 1e-3;
 
@@ -98,7 +101,7 @@ impl Frames {
         let first = frames.iter().zip(images).find_map(|(frame, (_, image))| Some((frame, image.as_ref()?)));
         let (mut common, mut unclear, mut contradicting) = (None, BTreeSet::new(), None);
         let mut views = Vec::with_capacity(frames.len());
-        let (mut rounded, mut blunt) = (vec![], vec![]);
+        let (mut rounded, mut blunt, mut shared) = (vec![], vec![], vec![]);
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
             check_known(frame)?;
             let pose = matrix::pose(frame, "transform_matrix")?.and_then(|pose| check_finite(frame).map(|()| pose));
@@ -132,6 +135,9 @@ impl Frames {
             if contradicting.is_none() {
                 contradicting = layers[i].contradiction(&camera, angle_y);
             }
+            if image.is_some() && layers[i].is_focal_alone(&camera, angle_y)? {
+                shared.push(views.len());
+            }
             views.push(View {
                 image: image.as_ref().map(|image| image.path.clone()),
                 mask: needed(frame, "mask_path", &masks[i], image.is_some())?,
@@ -141,6 +147,7 @@ impl Frames {
             });
         }
         check_distinct(top, &views)?;
+        check_same_camera(top, shared.into_iter().map(|i| &views[i]))?;
         self.assumptions.extend(contradicting.into_iter().chain(first_of(&rounded)).chain(first_of(&blunt)));
         if let Some(first) = unclear.first() {
             let first = first.strip_prefix(folder).unwrap_or(first).display();
@@ -176,6 +183,24 @@ fn check_distinct(top: &Object<'_>, views: &[View]) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Checks that images with the file's focal length, which gives no size, are of one camera: copies of any size, upright
+/// or on their side.
+///
+/// # Errors
+/// If two are not.
+fn check_same_camera<'a>(top: &Object<'_>, mut views: impl Iterator<Item = &'a View>) -> Result<()> {
+    let share = |view: &View| view.camera.focal[0] / view.camera.width.max(view.camera.height) as f64;
+    let Some(first) = views.next() else { return Ok(()) };
+    let Some(other) = views.find(|view| (share(view) / share(first) - 1.0).abs() > SAME_CAMERA) else { return Ok(()) };
+    let [one, two] =
+        [first, other].map(|View { name, camera, .. }| format!("{}x{} (`{name}`)", camera.width, camera.height));
+    let what = format!(
+        "is missing beside the focal length, which images of {one} and {two} share: if they are scaled, cropped or \
+         turned, give each frame its own `w`, `h` and `fl_x`"
+    );
+    Err(top.error("w", what))
 }
 
 /// A note on the frames of a scene that moves, as those of D-NeRF.

@@ -12,7 +12,7 @@ use serde_json::{Map, Value};
 use std::f64::consts::PI;
 
 /// Unsupported camera fields of instant-ngp and nerfstudio. Ignoring them silently would spoil every image.
-const NOT_READ: [&str; 14] = [
+const NOT_READ: [&str; 16] = [
     "x_fov",
     "y_fov",
     "distortion_params",
@@ -27,6 +27,8 @@ const NOT_READ: [&str; 14] = [
     "rolling_shutter",
     "transform_matrix_start",
     "transform_matrix_end",
+    "black_transparent",
+    "fix_premult",
 ];
 
 /// Lists of distortion coefficients in other programs. They count where none are given by name.
@@ -88,6 +90,7 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
         "rolling_shutter" | "transform_matrix_start" | "transform_matrix_end" => {
             "rolling shutter is not supported; remove it to ignore it"
         }
+        "black_transparent" | "fix_premult" => "write the transparency into the images; remove it to ignore it",
         _ => "such cameras are not supported; remove it to ignore it",
     };
     Err(object.error(name, format!("is {}, which raygrad does not read: {what}", shown(value))))
@@ -202,6 +205,12 @@ impl Layers<'_, '_> {
             }
             ([Some(f), None] | [None, Some(f)], _) => Ok([f, f]),
         }
+    }
+
+    /// True if the frame has the file's focal length, and none gives the size of its image.
+    pub(super) fn is_focal_alone(&self, camera: &Camera, angle_y: bool) -> Result<bool> {
+        let own = focal_of(self.frame, [camera.width, camera.height], angle_y)?;
+        Ok(own == [None; 2] && self.size()?.is_none() && camera.lens != Lens::Equirectangular)
     }
 
     /// A note on a field of view that contradicts the focal length of `camera`, which counts, as in other programs.

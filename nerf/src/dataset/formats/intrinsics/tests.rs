@@ -341,6 +341,8 @@ fn unsupported_camera_fields_are_named() {
     ] {
         fails(|d| d[name] = value.clone(), &[&format!("`{name}`: is "), hint, "which raygrad does not read"]);
         fails(|d| d["frames"][1][name] = value, &[&format!("`frames[1].{name}`: is "), hint]);
+        ("black_transparent", json!(true), "write the transparency into the images; remove it to ignore it"),
+        ("fix_premult", json!(true), "write the transparency into the images; remove it to ignore it"),
         for nothing in [json!(null), json!(false), json!(0), json!([0, 0.0, [0]]), json!([]), json!({ "k1": "0" })] {
             assert_eq!(cameras(|d| d[name] = nothing), cameras(|_| {}), "{name}");
         }
@@ -392,7 +394,7 @@ fn invalid_camera_numbers_are_named() {
 #[test]
 fn missing_sizes_come_from_the_images() {
     let folder = tempfile::tempdir().unwrap();
-    let mut document = json!({ "camera_angle_x": 0.8, "frames": frames(&["a", "0.png", "1.png", "2"]) });
+    let mut document = json!({ "fl_x": 9, "frames": frames(&["a", "0.png", "1.png", "2"]) });
     let read = |document: &Value| {
         std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
         let views = transforms::read(folder.path())?.views;
@@ -405,6 +407,15 @@ fn missing_sizes_come_from_the_images() {
     std::fs::write(folder.path().join("1.png"), b"not a picture").unwrap();
     says(&read(&document).unwrap_err().to_string(), &["`frames[2].file_path`: ", "1.png: cannot be decoded"]);
     set(&mut document, &json!({ "w": 16, "h": 12 }));
+    let mut angle = document.clone();
+    set(&mut angle, &json!({ "fl_x": null, "camera_angle_x": 0.8 }));
+    let shared = ["`w`: is missing", "8x6 (`0.png`) and 6x8 (`1.png`) share", "each frame its own `w`, `h` and `fl_x`"];
+    says(&read(&angle).unwrap_err().to_string(), &shared);
+    picture(&folder.path().join("1.png"), 16, 12);
+    assert_eq!(read(&angle).unwrap()[2], [16, 12], "a copy of another size has the same field of view");
+    says(&read(&document).unwrap_err().to_string(), &["`w`: is missing", "8x6 (`0.png`) and 16x12 (`1.png`) share"]);
+    document["frames"][2]["fl_x"] = json!(18);
+    assert_eq!(read(&document).unwrap()[2], [16, 12]);
     assert_eq!(read(&document).unwrap(), [[16, 12]; 4], "headers are not read");
 }
 
