@@ -29,6 +29,9 @@ const EXPORTS: [(&str, &str, &str); 18] = [
     ("database.db", "a COLMAP project without a model", "run COLMAP's mapper, or `raygrad prepare` on the images"),
 ];
 
+/// Endings of archives. Those of Record3D are zip files.
+const ARCHIVES: [&str; 7] = ["zip", "r3d", "7z", "rar", "tar", "gz", "tgz"];
+
 /// The deepest folder that is searched for a description in an unusual place.
 const DEEPEST: usize = 3;
 
@@ -185,6 +188,9 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
         return Err(Error::file(path, "there is no such folder"));
     }
     if path.is_file() {
+        if is_archive(path) {
+            return Err(Error::file(path, "is an archive: unpack it, and name the folder"));
+        }
         let what = "does not describe a capture: name a folder, a .json file, poses_bounds.npy, or images.bin of a COLMAP \
                     model";
         let description = Description::of_file(path).ok_or_else(|| Error::file(path, what))?;
@@ -258,6 +264,12 @@ pub(in crate::dataset) fn is_described(folder: &Path) -> bool {
     is_near || EXPORTS.iter().any(|(name, ..)| folder.join(name).exists()) || !elsewhere(folder).is_empty()
 }
 
+/// Returns true for the name of an archive.
+fn is_archive(path: &Path) -> bool {
+    let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
+    ARCHIVES.iter().any(|other| other.eq_ignore_ascii_case(ending))
+}
+
 /// The error of a folder without a description.
 fn unknown(folder: &Path, asked: Option<Format>) -> Error {
     if let Some(format) = asked {
@@ -275,6 +287,13 @@ fn unknown(folder: &Path, asked: Option<Format>) -> Error {
     }
     if let Some((_, what, remedy)) = EXPORTS.iter().find(|(name, ..)| folder.join(name).exists()) {
         return Error::file(folder, format!("is {what}, which raygrad does not read: {remedy}"));
+    }
+    let files = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    if let Some(archive) = files.filter(|path| is_archive(path)).min() {
+        return Error::file(
+            folder,
+            format!("is not a dataset, but holds the archive `{}`: unpack it", below(folder, &archive)),
+        );
     }
     let what = "is not a dataset: expected transforms.json (instant-ngp, nerfstudio), transforms_train.json (Blender), \
         sparse/0/cameras.bin or .txt (COLMAP) or poses_bounds.npy (LLFF); `raygrad prepare` makes one from a video or \

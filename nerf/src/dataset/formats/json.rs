@@ -114,7 +114,7 @@ impl<'a> Object<'a> {
 
     /// The elements of the list `frames`, at least one.
     pub(super) fn frames(&self) -> Result<Vec<Object<'a>>> {
-        let frames = self.get("frames").ok_or_else(|| self.error("frames", "is missing"))?;
+        let frames = self.required("frames")?;
         let frames = frames.as_array().ok_or_else(|| self.error("frames", "must be a list"))?;
         if frames.is_empty() {
             return Err(self.error("frames", "is empty: add at least one frame"));
@@ -135,9 +135,15 @@ impl<'a> Object<'a> {
         member(name).or_else(other)
     }
 
-    /// A required member.
+    /// A required member. The error lists others, of which one may be it under another name.
     pub(super) fn required(&self, name: &str) -> Result<&'a Value> {
-        self.get(name).ok_or_else(|| self.error(name, "is missing"))
+        const LISTED: usize = 8;
+        self.get(name).ok_or_else(|| {
+            let others = self.members.keys().filter(|other| *other != name).take(LISTED);
+            let others: Vec<String> = others.map(|other| shown(&Value::from(other.as_str()))).collect();
+            let beside = if others.is_empty() { String::new() } else { format!(" beside {}", others.join(", ")) };
+            self.error(name, format!("is missing{beside}"))
+        })
     }
 
     /// The path of a member in the document.
@@ -175,9 +181,11 @@ impl<'a> Object<'a> {
         self.typed(name, "a string", Value::as_str)
     }
 
-    /// A boolean, or a number as in Python.
+    /// A boolean, also as a string in any case, or a number as in Python.
     pub(super) fn flag(&self, name: &str) -> Result<Option<bool>> {
-        self.typed(name, "true or false", |value| value.as_bool().or_else(|| value.as_f64().map(|x| x != 0.0)))
+        let word = |value: &Value| value.as_str().and_then(|text| text.trim().to_lowercase().parse().ok());
+        let flag = |value: &Value| value.as_bool().or_else(|| number(value).map(|x| x != 0.0)).or_else(|| word(value));
+        self.typed(name, "true or false", flag)
     }
 }
 

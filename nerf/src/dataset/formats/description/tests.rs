@@ -117,6 +117,20 @@ fn both_encodings_of_a_model_count() {
 }
 
 #[test]
+fn archives_are_to_be_unpacked() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("Scan.ZIP");
+    std::fs::write(&file, "PK").unwrap();
+    let message = |path: &Path| read(path, None).unwrap_err().to_string();
+    assert!(message(&file).contains("Scan.ZIP: is an archive: unpack it, and name the folder"));
+    assert!(message(folder.path()).contains("is not a dataset, but holds the archive `Scan.ZIP`: unpack it"));
+    std::fs::write(folder.path().join("zip"), "").unwrap();
+    assert!(message(&folder.path().join("zip")).contains("does not describe a capture"));
+    write(folder.path(), Format::Transforms, [1, 1], 0);
+    assert_eq!(read(folder.path(), None).unwrap().views.len(), 1);
+}
+
+#[test]
 fn files_name_their_description() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();

@@ -254,6 +254,9 @@ fn is_fisheye_selects_the_fisheye_model() {
             false => fails(|d| set(d, &fields), &["`is_fisheye`: contradicts `camera_model`", model]),
         }
     }
+    let word = |word: &str| cameras(|d| set(d, &json!({ "camera_model": null, "k1": 0.1, "is_fisheye": word })));
+    assert_eq!(word(" False"), cameras(|d| set(d, &json!({ "camera_model": null, "k1": 0.1 }))));
+    assert_ne!(word("true"), word("false"));
     fails(|d| d["is_fisheye"] = json!("yes"), &["`is_fisheye`: must be true or false, is \"yes\""]);
     fails(|d| set(d, &json!({ "is_fisheye": true, "p1": 0.1 })), &["`p1`", "OPENCV_FISHEYE has no such"]);
 }
@@ -338,11 +341,11 @@ fn unsupported_camera_fields_are_named() {
         ("rolling_shutter", json!([0, 0, 1, 0]), "rolling shutter is not supported; remove it to ignore it"),
         ("transform_matrix_start", json!([[1, 0, 0, 0]]), "rolling shutter is not supported; remove it to ignore it"),
         ("transform_matrix_end", json!([[1, 0, 0, 0]]), "rolling shutter is not supported; remove it to ignore it"),
+        ("black_transparent", json!(true), "write the transparency into the images; remove it to ignore it"),
+        ("fix_premult", json!(true), "write the transparency into the images; remove it to ignore it"),
     ] {
         fails(|d| d[name] = value.clone(), &[&format!("`{name}`: is "), hint, "which raygrad does not read"]);
         fails(|d| d["frames"][1][name] = value, &[&format!("`frames[1].{name}`: is "), hint]);
-        ("black_transparent", json!(true), "write the transparency into the images; remove it to ignore it"),
-        ("fix_premult", json!(true), "write the transparency into the images; remove it to ignore it"),
         for nothing in [json!(null), json!(false), json!(0), json!([0, 0.0, [0]]), json!([]), json!({ "k1": "0" })] {
             assert_eq!(cameras(|d| d[name] = nothing), cameras(|_| {}), "{name}");
         }
@@ -404,9 +407,6 @@ fn missing_sizes_come_from_the_images() {
     picture(&folder.path().join("0.png"), 8, 6);
     picture(&folder.path().join("1.png"), 6, 8);
     assert_eq!(read(&document).unwrap(), [[8, 6], [8, 6], [6, 8], [8, 6]]);
-    std::fs::write(folder.path().join("1.png"), b"not a picture").unwrap();
-    says(&read(&document).unwrap_err().to_string(), &["`frames[2].file_path`: ", "1.png: cannot be decoded"]);
-    set(&mut document, &json!({ "w": 16, "h": 12 }));
     let mut angle = document.clone();
     set(&mut angle, &json!({ "fl_x": null, "camera_angle_x": 0.8 }));
     let shared = ["`w`: is missing", "8x6 (`0.png`) and 6x8 (`1.png`) share", "each frame its own `w`, `h` and `fl_x`"];
@@ -416,6 +416,9 @@ fn missing_sizes_come_from_the_images() {
     says(&read(&document).unwrap_err().to_string(), &["`w`: is missing", "8x6 (`0.png`) and 16x12 (`1.png`) share"]);
     document["frames"][2]["fl_x"] = json!(18);
     assert_eq!(read(&document).unwrap()[2], [16, 12]);
+    std::fs::write(folder.path().join("1.png"), b"not a picture").unwrap();
+    says(&read(&document).unwrap_err().to_string(), &["`frames[2].file_path`: ", "1.png: cannot be decoded"]);
+    set(&mut document, &json!({ "w": 16, "h": 12 }));
     assert_eq!(read(&document).unwrap(), [[16, 12]; 4], "headers are not read");
 }
 

@@ -224,7 +224,15 @@ fn invalid_documents_are_located() {
     fails(|d| d["frames"] = json!([]), &["`frames`: is empty"]);
     fails(|d| d["frames"] = json!({}), &["`frames`: must be a list"]);
     fails(|d| d["frames"][1] = json!(7), &["`frames[1]`: must be an object, is 7"]);
-    fails(|d| remove(&mut d["frames"][1], "file_path"), &["`frames[1].file_path`: is missing"]);
+    fails(
+        |d| remove(&mut d["frames"][1], "file_path"),
+        &["`frames[1].file_path`: is missing beside \"transform_matrix\""],
+    );
+    let renamed = |d: &mut Value| {
+        (d["frames"][1]["file"], d["frames"][1]["c2w"]) = (json!("images/1.png"), json!(0));
+        remove(&mut d["frames"][1], "file_path");
+    };
+    fails(renamed, &["`frames[1].file_path`: is missing beside \"c2w\", \"file\", \"transform_matrix\""]);
     fails(|d| d["frames"][1]["file_path"] = json!(3), &["`frames[1].file_path`: must be a string"]);
 }
 
