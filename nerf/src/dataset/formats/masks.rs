@@ -17,7 +17,9 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) {
     for view in &mut capture.views {
         // COLMAP's own naming comes first.
         let own = Path::new(&view.name);
+        let others = ["jpg", "jpeg", "webp"].map(|ending| own.with_extension(ending));
         let names = [format!("{}.png", view.name).into(), own.with_extension("png"), own.to_owned()];
+        let names: Vec<PathBuf> = names.into_iter().chain(others).collect();
         let mut paths = folders.iter().flat_map(|folder| names.iter().map(move |name| folder.join(name)));
         let exact = paths.clone().find(|path| path.is_file());
         view.mask = exact.or_else(|| paths.find_map(|path| in_any_case(&mut listings, &path)));

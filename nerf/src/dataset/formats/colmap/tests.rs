@@ -127,6 +127,16 @@ fn fields_are_list_indices_or_lines() {
 }
 
 #[test]
+fn integers_may_be_written_as_floats() {
+    let [cameras, images, points] = TEXT;
+    for (sizes, id) in [("100.0 80.000000", "9.0 b"), ("1e2 8.0e+01", "9.000000000000000000e+00 b")] {
+        assert!(cameras.contains("100 80") && images.contains(" 9 b"));
+        let files = [cameras.replace("100 80", sizes), images.replace(" 9 b", &format!(" {id}")), points.to_owned()];
+        is_the_fixture(&read(folder(Encoding::Text, "sparse/0", &files.map(String::into_bytes)).path()).unwrap());
+    }
+}
+
+#[test]
 fn colmap_binary_comes_first_rigs_are_skipped() {
     let folder = folder(Encoding::Binary, "sparse/0", &binary());
     let model = folder.path().join("sparse/0");
@@ -176,6 +186,10 @@ fn masks_are_found_in_any_case() {
         ("A.PNG.png", true),
         ("a.PNG", true),
         ("A.png", true),
+        ("a.jpg", true),
+        ("A.JPEG", true),
+        ("a.webp", true),
+        ("a.npy", false),
         ("a.mask.png", false),
         ("b.png", false),
         ("a.png/x", false),
@@ -222,7 +236,7 @@ fn text_errors_name_the_line() {
         (0, "9 SIMPLE", "7 SIMPLE", "`line 4`", "camera_id: is `7`, as that of line 2 is"),
         (0, "100 80", "0 80", "`line 4`", "width: must be 1 to"),
         (0, "100 80", "100 99999999999", "`line 4`", "height: must be 1 to"),
-        (0, "100 80", "100.0 80", "`line 4`", "WIDTH: must be an integer of 64 bits, is `100.0`"),
+        (0, "100 80", "100.5 80", "`line 4`", "WIDTH: must be an integer of 64 bits, is `100.5`"),
         (0, " 90 ", " -90 ", "`line 4`", "focal length: must be more than 0, is -90"),
         (0, "9 SIMPLE", "-9 SIMPLE", "`line 4`", "CAMERA_ID: must be an integer of 32 bits"),
         (1, "0.5 0.5 0.5 0.5", "0 0 0 0", "`line 3`", "qvec: is a quaternion of length 0"),

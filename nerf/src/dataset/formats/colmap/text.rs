@@ -14,6 +14,9 @@ use std::fmt::Write;
 use std::path::Path;
 use std::str::FromStr;
 
+/// The least float whose neighbours are not all integers apart by 1.
+const EXACT: f64 = 9_007_199_254_740_992.0;
+
 /// The unread part of a line.
 struct Words<'a> {
     file: &'a Path,
@@ -33,10 +36,11 @@ impl<'a> Words<'a> {
         if word.is_empty() { Err(self.error(member, "is missing")) } else { Ok(word) }
     }
 
-    /// Reads an integer.
+    /// Reads an integer, which scripts write as `640.0` or `6.4e+02`, too.
     fn integer<T: FromStr>(&mut self, member: &str) -> Result<T> {
         let word = self.word(member)?;
-        word.parse().map_err(|_| {
+        let whole = || word.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && x.abs() < EXACT);
+        word.parse().ok().or_else(|| whole()?.to_string().parse().ok()).ok_or_else(|| {
             let most = 8 * size_of::<T>();
             self.error(member, format!("must be an integer of {most} bits, is `{}`", start(word)))
         })
