@@ -1,6 +1,8 @@
 //! Formulas on a tape: numbers that stand for variables.
 
+use crate::ops::activation::LogisticDensity;
 use crate::ops::arithmetic::MulAdd;
+use crate::ops::trigonometric::Cosine;
 use crate::{Formula, Var};
 use raygrad_tensor::{Plain, Real, Scalar};
 use std::array::from_fn;
@@ -177,6 +179,12 @@ impl<T: Scalar> Real for Recorded<'_, '_, T> {
     }
     fn mul_add(self, factor: Self, summand: Self) -> Self {
         self.sheet.push(Step::MulAdd([self.index, factor.index, summand.index]))
+    }
+    fn logistic_density(self) -> Self {
+        self.unary(|x| LogisticDensity.on([x]))
+    }
+    fn along(self, a: Self, b: Self, _length: Self) -> Self {
+        self * a.binary(b, |a, b| Cosine.on([a, b]))
     }
     type Wide = Plain<Self>;
     raygrad_tensor::functions!(recorded());

@@ -109,19 +109,10 @@ pub(crate) fn near_sigmoid<E: Real>(x: E, low: E) -> E {
     share.mul_add((share.like(1.0) - share) * low, share)
 }
 
-/// The derivative of the sigmoid, an even function, by one exponential and one division.
-#[inline(always)]
-fn logistic_density<E: Real>(x: E) -> E {
-    // A choice and no absolute value, which has no derivative at 0.
-    let (one, e) = (x.like(1.0), x.if_positive(-x, x).exp());
-    let share = one / (one + e);
-    e * (share * share)
-}
-
 /// The derivative of the sigmoid, as a product that keeps its digits where the sigmoid is near 1.
 #[inline(always)]
 pub(crate) fn sigmoid_slope<E: Real>(s: E, x: E) -> E {
-    let slope = logistic_density(x);
+    let slope = x.logistic_density();
     checked!(s * slope, s, [], [slope], (s.wide() * wide_sigmoid(x) * wide_sigmoid(-x)).narrow())
 }
 
@@ -136,7 +127,7 @@ pub(crate) fn softplus_slope<E: Real>(s: E, x: E) -> E {
 #[inline(always)]
 pub(crate) fn tanh_slope<E: Real>(s: E, x: E) -> E {
     let (twice, four) = (x + x, x.like(4.0));
-    let density = logistic_density(twice);
+    let density = twice.logistic_density();
     checked!(
         s * (four * density),
         s * four,
@@ -228,7 +219,7 @@ pub(crate) fn turn<E: Real>(s: E, c: E, a: E, b: E) -> E {
 /// has lost digits.
 #[inline(always)]
 pub(crate) fn length_slope<E: Real>(s: E, a: E, b: E, y: E) -> E {
-    let quick = s * a / unless_zero(y);
+    let quick = s.along(a, b, unless_zero(y));
     checked!(quick, s, [s, a, y], [], {
         let scale = unless_zero(a.abs().maximum(b.abs()));
         let length = unit_square(a / scale, b / scale).sqrt();
@@ -247,7 +238,7 @@ fn unit_square<E: Real>(a: E, b: E) -> E {
 
 /// `x`, which is not negative, and infinity for 0: a quotient by it is 0, and so are its derivatives.
 #[inline(always)]
-fn unless_zero<E: Real>(x: E) -> E {
+pub(crate) fn unless_zero<E: Real>(x: E) -> E {
     x.if_positive(x, x + x.like(f64::INFINITY))
 }
 

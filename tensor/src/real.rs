@@ -83,6 +83,22 @@ pub trait Real:
     /// `self * factor + summand`, rounded once on floats.
     fn mul_add(self, factor: Self, summand: Self) -> Self;
 
+    /// The derivative of the sigmoid, an even function, by one exponential and one division.
+    #[doc(hidden)]
+    #[inline(always)]
+    fn logistic_density(self) -> Self {
+        // A choice and no absolute value, which has no derivative at 0.
+        let (one, e) = (self.like(1.0), self.if_positive(-self, self).exp());
+        let share = one / (one + e);
+        e * (share * share)
+    }
+    /// `self` times a of a vector (a, b) of this length, by the length.
+    #[doc(hidden)]
+    #[inline(always)]
+    fn along(self, a: Self, _b: Self, length: Self) -> Self {
+        self * a / length
+    }
+
     /// `quick`, or `exact` where `quick` may have left the range of the type on the way:
     ///
     /// * where one of the `inputs` is not 0, infinite or within 2^-63 and 2^63 (2^-511 and 2^511 for f64);

@@ -45,6 +45,25 @@ impl Formula<1> for Sigmoid {
     }
 }
 
+/// y = s(x) s(-x), the derivative of the sigmoid s; dx = -g y tanh(x / 2), a product that keeps its digits close to 0.
+#[derive(Clone, Copy)]
+pub struct LogisticDensity;
+impl Formula<1> for LogisticDensity {
+    const NAME: &'static str = "logistic_density";
+    #[inline(always)]
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        x.logistic_density()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], y: E) -> [E; 1] {
+        [-(g * y * (x.like(0.5) * x).tanh())]
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).at([0.0], 0.25, [0.0]).at([-INF], 0.0, [0.0]).at([INF], 0.0, [0.0]);
+        c.at([1e-10], 0.25, [-1.25e-11]);
+    }
+}
+
 /// y = ln(1 + e^x); dx = g s(x).
 #[derive(Clone, Copy)]
 pub struct Softplus;
@@ -282,5 +301,5 @@ elementwise! {
     gelu_tanh() = GeluTanh;
     /// SiLU, also called swish: `self * sigmoid(self)`.
     silu() = Silu;
-    also examined: LeakyRelu { slope: 0.125 }, Elu { alpha: 1.5 };
+    also examined: LogisticDensity, LeakyRelu { slope: 0.125 }, Elu { alpha: 1.5 };
 }

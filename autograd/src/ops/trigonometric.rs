@@ -1,7 +1,7 @@
 //! Trigonometric and hyperbolic functions, and inverse ones.
 
 use crate::cases::{INF, PI};
-use crate::slopes::{atan_slope, complement, length_slope, turn};
+use crate::slopes::{atan_slope, complement, length_slope, turn, unless_zero};
 use crate::{Cases, Formula};
 use raygrad_tensor::Real;
 
@@ -205,6 +205,28 @@ impl Formula<2> for Hypot {
     }
 }
 
+/// y = a / |(a, b)|, the derivative of the length by a; with z = b / |(a, b)|, da = g z^2 / |(a, b)| and
+/// db = -g y z / |(a, b)|, products that keep their digits where b is small. 0 at the origin.
+#[derive(Clone, Copy)]
+pub struct Cosine;
+impl Formula<2> for Cosine {
+    const NAME: &'static str = "cosine";
+    #[inline(always)]
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
+        a / unless_zero(a.hypot(b))
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], y: E) -> [E; 2] {
+        let length = unless_zero(a.hypot(b));
+        let across = g.along(b, a, length) / length;
+        [across.along(b, a, length), -(across * y)]
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(0.5..3.0).domain(-3.0..3.0).at([0.0, 0.0], 0.0, [0.0, 0.0]).at([3.0, 4.0], 0.6, [0.128, -0.096]);
+        c.at([1.0, 1e-10], 1.0, [1e-20, -1e-10]);
+    }
+}
+
 /// y = sinh x; dx = g cosh x.
 #[derive(Clone, Copy)]
 pub struct Sinh;
@@ -269,4 +291,5 @@ elementwise! {
     sinh() = Sinh;
     /// Hyperbolic cosine.
     cosh() = Cosh;
+    also examined: Cosine;
 }
