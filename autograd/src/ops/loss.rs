@@ -247,7 +247,18 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ.
     #[track_caller]
     pub fn mse_loss(&self, target: impl Operand<'t, T>) -> Self {
-        self.squared_error(target).mean()
+        let target = target.on(self.tape());
+        let loss = self.squared_error(&target).mean();
+        if loss.item().is_finite() { loss } else { self.scaled_mse_loss(&target) }
+    }
+
+    /// [`mse_loss`](Self::mse_loss) where a square is out of range: the mean in units of a power of two, at least n.
+    #[cold]
+    #[track_caller]
+    fn scaled_mse_loss(&self, target: &Self) -> Self {
+        let up = self.value().len().next_power_of_two() as f64;
+        let r = self - target;
+        (&r * (&r / up)).mean() * up
     }
 
     /// The absolute error of each element, `|self - target|`. The gradient at equality is 0.

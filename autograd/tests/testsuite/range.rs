@@ -730,6 +730,22 @@ fn means_at_the_end_of_the_range() {
 }
 
 /// Means of windows, and of gradients of windows that share a pixel, of numbers whose sum is out of range.
+/// A square overflows, but the mean does not.
+#[test]
+fn mean_of_squares_beyond_the_range() {
+    let tape = Tape::<f32>::new();
+    let x = tape.leaf(Tensor::from([2.6e19_f32, 0.0, 1e19, 0.0, 1.0]));
+    let loss = x.mse_loss(tape.constant(Tensor::zeros(&[5])));
+    let close = |got: f32, exact: f64| assert!((f64::from(got) / exact - 1.0).abs() < 3e-7, "{got:e} for {exact:e}");
+    close(loss.item(), (f64::from(2.6e19_f32).powi(2) + f64::from(1e19_f32).powi(2) + 1.0) / 5.0);
+    let first = loss.grad_graph(&[&x]).remove(0);
+    for (got, x) in first.value().iter().zip(x.value().iter()).filter(|&(_, x)| x != 0.0) {
+        close(got, 0.4 * f64::from(x));
+    }
+    first.sum().grad(&[&x])[0].iter().for_each(|got| close(got, 0.4));
+    assert_eq!(x.mse_loss(tape.constant(Tensor::full(&[5], -1e38))).item(), f32::INFINITY);
+}
+
 #[test]
 fn pooled_means_at_the_end_of_the_range() {
     fn check<T: Scalar>(most: T) {
