@@ -59,13 +59,21 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let files = ["cameras.png", "doctor.html"].map(|name| args.out.join(name));
     files.iter().try_for_each(|file| job.check(file))?;
     let capture = Capture::read(folder)?;
-    // The analysis fails for a capture without extent; the report gives the reason.
-    let analysis = capture.analyze_scene(args.scene_type).ok();
+    let (analysis, failure) = match capture.analyze_scene(args.scene_type) {
+        Ok(analysis) => (Some(analysis), None),
+        Err(failure) => (None, Some(failure)),
+    };
     make_folder(&args.out)?;
     let progress = Progress::new();
     let show = |done: usize, total: usize| progress.count(done, total, "images checked");
     let report = examine(&capture, analysis.as_ref(), &DoctorOptions { progress: &show, ..DoctorOptions::default() });
     drop(progress);
+    // Training would fail, and the report does not say why.
+    if let Some(failure) = failure
+        && report.severity() < Some(Severity::Error)
+    {
+        return Err(failure);
+    }
     let stage = Stage::new(&capture, analysis.as_ref(), &report);
     let drawn = drawing::draw(&stage).map_err(|e| Error::file(&files[0], e))?;
     let page = page::page(&capture, &report, &stage, job.mark())?;

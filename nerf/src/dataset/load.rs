@@ -245,15 +245,23 @@ impl Capture {
         }
         if let Some((view, most)) = faint.first().filter(|_| faint.len() == total) {
             let what = format!(
-                "has alpha {most} in every pixel, and others have one value too: remove the alpha channel, or make the \
-                 object opaque in it"
+                "has alpha {:.0} of 255 in every pixel of `{}`, and the other images that were looked at have one value \
+                 too: remove the alpha channel, or make the object opaque in it",
+                255.0 * most,
+                view.name
             );
             return Err(Error::field(&self.file, &view.field, what));
         }
         if let Some((view, most)) = low.first().filter(|_| low.len() == total) {
             let what = format!(
-                "has 16 bits per channel, but no value above {most} of 65535, as others: multiply images of 8, 10 or 12 \
-                 bits by 257, 64 or 16"
+                "has 16 bits per channel in `{}`, but no value above {most} of 65535, nor have the other images that \
+                 were looked at: multiply all values by {}",
+                view.name,
+                match most {
+                    0..256 => 257,
+                    256..1024 => 64,
+                    _ => 16,
+                }
             );
             return Err(Error::field(&self.file, &view.field, what));
         }

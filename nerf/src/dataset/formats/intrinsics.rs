@@ -1,6 +1,6 @@
 //! Focal lengths, principal points and sizes: of a whole file, or of a frame of it.
 
-use super::json::{Object, number, shown};
+use super::json::{Object, number, shown, truth};
 use super::layers::Layers;
 use super::lens;
 use super::matrix::entries;
@@ -12,7 +12,7 @@ use serde_json::{Map, Value};
 use std::f64::consts::PI;
 
 /// Unsupported camera fields of instant-ngp and nerfstudio. Ignoring them silently would spoil every image.
-const NOT_READ: [&str; 16] = [
+const NOT_READ: [&str; 15] = [
     "x_fov",
     "y_fov",
     "distortion_params",
@@ -28,7 +28,6 @@ const NOT_READ: [&str; 16] = [
     "transform_matrix_start",
     "transform_matrix_end",
     "black_transparent",
-    "fix_premult",
 ];
 
 /// Lists of distortion coefficients in other programs. They count where none are given by name.
@@ -67,10 +66,9 @@ const PANORAMA: f64 = 0.01;
 pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     fn nothing(value: &Value) -> bool {
         match value {
-            Value::Bool(flag) => !flag,
             Value::Array(values) => values.iter().all(nothing),
             Value::Object(members) => members.values().all(nothing),
-            value => number(value) == Some(0.0),
+            value => truth(value) == Some(false),
         }
     }
     // A number is a distance, and a text such as "none" no coefficient.
@@ -90,7 +88,7 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
         "rolling_shutter" | "transform_matrix_start" | "transform_matrix_end" => {
             "rolling shutter is not supported; remove it to ignore it"
         }
-        "black_transparent" | "fix_premult" => "write the transparency into the images; remove it to ignore it",
+        "black_transparent" => "write the transparency into the images; remove it to ignore it",
         _ => "such cameras are not supported; remove it to ignore it",
     };
     Err(object.error(name, format!("is {}, which raygrad does not read: {what}", shown(value))))

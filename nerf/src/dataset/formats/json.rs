@@ -183,10 +183,14 @@ impl<'a> Object<'a> {
 
     /// A boolean, also as a string in any case, or a number as in Python.
     pub(super) fn flag(&self, name: &str) -> Result<Option<bool>> {
-        let word = |value: &Value| value.as_str().and_then(|text| text.trim().to_lowercase().parse().ok());
-        let flag = |value: &Value| value.as_bool().or_else(|| number(value).map(|x| x != 0.0)).or_else(|| word(value));
-        self.typed(name, "true or false", flag)
+        self.typed(name, "true or false", truth)
     }
+}
+
+/// A boolean, also as a string in any case, or a number as in Python.
+pub(super) fn truth(value: &Value) -> Option<bool> {
+    let word = |value: &Value| value.as_str().and_then(|text| text.trim().to_lowercase().parse().ok());
+    value.as_bool().or_else(|| number(value).map(|x| x != 0.0)).or_else(|| word(value))
 }
 
 #[cfg(test)]

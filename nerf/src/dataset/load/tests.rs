@@ -417,13 +417,15 @@ fn alpha_and_bits_that_say_nothing_are_refused() {
         let message = analyze(&|i| [9 * i as u16, 9000, 50000, alpha]).unwrap_err();
         assert!(message.contains("in every pixel") && message.contains("remove the alpha channel"), "{message}");
     }
-    for bits in [8, 10, 12] {
+    for (bits, factor) in [(8, 257), (10, 64), (12, 16)] {
         let message = analyze(&|_| [(1 << bits) - 1, 3, 1, whole]).unwrap_err();
         assert!(message.contains(&format!("no value above {} of 65535", (1 << bits) - 1)), "{message}");
+        assert!(message.ends_with(&format!("multiply all values by {factor}")), "{message}");
     }
     let opaque = |i: usize| [9 * i as u16, 9000, 50000, 65279];
     assert_eq!(analyze(&opaque).unwrap(), SceneType::Unbounded, "254 of 255 is a rounding error");
     assert_eq!(analyze(&|i| [5000, 0, 0, if i < 40 { 0 } else { whole / 2 }]).unwrap(), SceneType::Bounded);
+    assert_eq!(analyze(&|_| [1 << 12, 0, 0, whole]).unwrap(), SceneType::Unbounded, "13 bits may be a dark image");
     assert_eq!(analyze(&|_| [0, 0, 0, whole]).unwrap(), SceneType::Unbounded, "black images have no bits");
     assert_eq!(analyze(&|_| [whole; 4]).unwrap(), SceneType::Bounded, "opaque alpha changes nothing of white");
 }

@@ -130,8 +130,9 @@ fn fields_are_list_indices_or_lines() {
 fn integers_may_be_written_as_floats() {
     let [cameras, images, points] = TEXT;
     for (sizes, id) in [("100.0 80.000000", "9.0 b"), ("1e2 8.0e+01", "9.000000000000000000e+00 b")] {
-        assert!(cameras.contains("100 80") && images.contains(" 9 b"));
-        let files = [cameras.replace("100 80", sizes), images.replace(" 9 b", &format!(" {id}")), points.to_owned()];
+        assert!(cameras.contains("100 80") && images.contains(" 9 b") && images.contains(" -1 \n"));
+        let images = images.replace(" 9 b", &format!(" {id}")).replace(" -1 \n", " -1.0\n");
+        let files = [cameras.replace("100 80", sizes), images, points.to_owned()];
         is_the_fixture(&read(folder(Encoding::Text, "sparse/0", &files.map(String::into_bytes)).path()).unwrap());
     }
 }

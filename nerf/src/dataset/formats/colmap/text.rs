@@ -138,7 +138,8 @@ fn observations(line: &Words<'_>) -> Result<()> {
     for word in line.rest.split_whitespace() {
         (count, last) = (count + 1, word);
     }
-    if count % 3 != 0 || last.parse::<i64>().is_err() {
+    let is_id = last.parse::<f64>().is_ok_and(|id| id.fract() == 0.0);
+    if count % 3 != 0 || !is_id {
         let what = "must be triples X Y POINT3D_ID of the image in the line before, or empty";
         return Err(line.error("POINTS2D", what));
     }

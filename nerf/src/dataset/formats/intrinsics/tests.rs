@@ -341,12 +341,13 @@ fn unsupported_camera_fields_are_named() {
         ("rolling_shutter", json!([0, 0, 1, 0]), "rolling shutter is not supported; remove it to ignore it"),
         ("transform_matrix_start", json!([[1, 0, 0, 0]]), "rolling shutter is not supported; remove it to ignore it"),
         ("transform_matrix_end", json!([[1, 0, 0, 0]]), "rolling shutter is not supported; remove it to ignore it"),
-        ("black_transparent", json!(true), "write the transparency into the images; remove it to ignore it"),
-        ("fix_premult", json!(true), "write the transparency into the images; remove it to ignore it"),
+        ("black_transparent", json!("True"), "write the transparency into the images; remove it to ignore it"),
     ] {
         fails(|d| d[name] = value.clone(), &[&format!("`{name}`: is "), hint, "which raygrad does not read"]);
         fails(|d| d["frames"][1][name] = value, &[&format!("`frames[1].{name}`: is "), hint]);
-        for nothing in [json!(null), json!(false), json!(0), json!([0, 0.0, [0]]), json!([]), json!({ "k1": "0" })] {
+        for nothing in
+            [json!(null), json!(false), json!("False"), json!(0), json!([0, 0.0, [0]]), json!([]), json!({ "k1": "0" })]
+        {
             assert_eq!(cameras(|d| d[name] = nothing), cameras(|_| {}), "{name}");
         }
     }
