@@ -92,7 +92,7 @@ pub trait Real:
         let share = one / (one + e);
         e * (share * share)
     }
-    /// `self` times a of a vector (a, b) of this length, by the length.
+    /// `self` times a / `length`, where (a, b) has this length: `self` times the derivative of the length by a.
     #[doc(hidden)]
     #[inline(always)]
     fn along(self, a: Self, _b: Self, length: Self) -> Self {
