@@ -222,6 +222,17 @@ impl<T: Scalar> Op<T> for CrossEntropy {
     }
 }
 
+/// The mean of `loss`. Where that is out of range, it is the mean of `scaled(up)`, which is `loss / up`, times `up`: a
+/// power of two of at least the number of elements.
+fn mean_in_range<'t, T: Scalar>(loss: Var<'t, T>, scaled: impl FnOnce(f64) -> Var<'t, T>) -> Var<'t, T> {
+    let mean = loss.mean();
+    if mean.item().is_finite() {
+        return mean;
+    }
+    let up = loss.value().len().next_power_of_two() as f64;
+    scaled(up).mean() * up
+}
+
 impl<'t, T: Scalar> Var<'t, T> {
     /// A loss of each element. Shapes must be equal: broadcasting in a loss is most often a mistake.
     #[track_caller]
@@ -248,17 +259,11 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn mse_loss(&self, target: impl Operand<'t, T>) -> Self {
         let target = target.on(self.tape());
-        let loss = self.squared_error(&target).mean();
-        if loss.item().is_finite() { loss } else { self.scaled_mse_loss(&target) }
-    }
-
-    /// [`mse_loss`](Self::mse_loss) where a square is out of range: the mean in units of a power of two, at least n.
-    #[cold]
-    #[track_caller]
-    fn scaled_mse_loss(&self, target: &Self) -> Self {
-        let up = self.value().len().next_power_of_two() as f64;
-        let r = self - target;
-        (&r * (&r / up)).mean() * up
+        let scaled = |up: f64| {
+            let r = self - &target;
+            &r * (&r / up)
+        };
+        mean_in_range(self.squared_error(&target), scaled)
     }
 
     /// The absolute error of each element, `|self - target|`. The gradient at equality is 0.
@@ -276,7 +281,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ.
     #[track_caller]
     pub fn l1_loss(&self, target: impl Operand<'t, T>) -> Self {
-        self.absolute_error(target).mean()
+        let target = target.on(self.tape());
+        mean_in_range(self.absolute_error(&target), |up| (self / up - &target / up).abs())
     }
 
     /// The Huber loss of each element. With `r = self - target` it is `r^2 / 2` for `|r| <= delta`, and
@@ -296,7 +302,16 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// Where [`huber`](Self::huber) panics.
     #[track_caller]
     pub fn huber_loss(&self, target: impl Operand<'t, T>, delta: f64) -> Self {
-        self.huber(target, delta).mean()
+        let target = target.on(self.tape());
+        mean_in_range(self.huber(&target, delta), |up| self.scaled_huber(&target, delta, up) * delta)
+    }
+
+    /// `smooth_l1 / up` for a `beta` above 0, with the division before the difference.
+    fn scaled_huber(&self, target: &Self, beta: f64, up: f64) -> Self {
+        // With m, the smaller of |r| and beta: m / beta (|r| - m / 2).
+        let m = (self - target).abs().minimum(self.constant(beta));
+        let above = (self / up - target / up).abs() - &m * (0.5 / up);
+        m / beta * above
     }
 
     /// The Huber loss divided by `beta`, of each element: the slope is 1 beyond `beta`. For `beta` 0 it is the absolute
@@ -316,7 +331,12 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// Where [`smooth_l1`](Self::smooth_l1) panics.
     #[track_caller]
     pub fn smooth_l1_loss(&self, target: impl Operand<'t, T>, beta: f64) -> Self {
-        self.smooth_l1(target, beta).mean()
+        let target = target.on(self.tape());
+        let scaled = |up: f64| match T::from_f64(beta) == T::ZERO {
+            true => (self / up - &target / up).abs(),
+            false => self.scaled_huber(&target, beta, up),
+        };
+        mean_in_range(self.smooth_l1(&target, beta), scaled)
     }
 
     /// The binary cross-entropy of each element, from logits: `-t ln s - (1 - t) ln(1 - s)`. Here `s` is the
@@ -370,7 +390,17 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// Where [`cross_entropy`](Self::cross_entropy) panics.
     #[track_caller]
     pub fn cross_entropy_loss(&self, classes: impl Into<Indices>) -> Self {
-        self.cross_entropy(classes).mean()
+        let classes = classes.into();
+        let loss = self.cross_entropy(classes.clone());
+        mean_in_range(loss.clone(), |up| {
+            // The logarithm of a row and the logit are in range where their difference is not.
+            let shape = loss.shape();
+            let mut column = Shape::from_slice(shape);
+            column.push(1);
+            let logits = self.gather(-1, Indices::new(&column, classes.values().clone())).reshape(shape);
+            let is_in_range = Mask::new(shape, loss.value().iter().map(|y| y.is_finite()).collect::<Vec<_>>());
+            (&loss / up).where_(&is_in_range, self.logsumexp_over(-1) / up - logits / up)
+        })
     }
 }
 

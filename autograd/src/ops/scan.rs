@@ -203,7 +203,7 @@ impl Running for f64 {
 }
 
 impl Walk {
-    /// Whether no product of `x` comes back after it has left the range of f64.
+    /// Whether no product of `x` is in the range of `T` after one has left that of f64.
     fn stays_in_range<T: Scalar>(self, shape: &[usize], x: &[T]) -> bool {
         // The order of positive numbers is that of their bits. Signed, which vectors compare.
         let sizes = simd::dispatch(
@@ -229,8 +229,8 @@ impl Walk {
             },
         );
         let [least, most] = sizes.map(|bits| f64::from_bits(bits as u64));
-        // A product that only falls stays too small.
-        most <= 1.0 || shape[self.axis] as f64 * most.log2().abs().max(least.log2().abs()) < 700.0
+        // A product that only falls below the range of f64 stays below that of f32.
+        T::EPSILON > 1e-10 && most <= 1.0 || shape[self.axis] as f64 * most.log2().abs().max(least.log2().abs()) < 700.0
     }
 
     /// The product of `x` up to each entry, in `y`. Whether all are right, if it is `CHECKED`.
