@@ -2,6 +2,7 @@
 
 use super::Entry;
 use super::spread;
+use crate::ops::gradient_op::GradientOp;
 use crate::ops::pick::{ELEMENTS, ENTRIES, PIXELS, Pick, Places, Put, ROWS};
 use crate::ops::{Conv2dConfig, Pool2dConfig, convolution, matmul, matrix, pooling, shape, vector};
 use crate::{INFER, Slice};
@@ -153,6 +154,9 @@ fn algebra() -> Vec<Entry> {
             .sample(&[&[0, 3]])
             .sample(&[&[2, 0]])
             .sample_of(vec![row(&[-0.7])]),
+        Entry::new(GradientOp { op: vector::Normalize, input: 0 })
+            .sample_of(vec![row(&[0.8, -0.6, 1.1]), row(&[-0.3, 0.7, 0.2])])
+            .sample(&[&[0, 3], &[0, 3]]),
     ]
 }
 

@@ -2,6 +2,7 @@
 
 use crate::cases::Extreme;
 use crate::formula::derived;
+use crate::ops::gradient_op::GradientOp;
 use crate::ops::trigonometric;
 use crate::ops::{Activation, Segments, activation, arithmetic, exponential, linear, matmul, reduce, segment, shape};
 use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, product, scan, select, softmax};
@@ -186,6 +187,12 @@ fn reductions() -> Vec<Entry> {
     };
     let walk = |axis, reverse| scan::Walk { axis, reverse };
     let wide: &[&[usize]] = &[&[3, 40]];
+    let layer_norm_grad = |input| {
+        Entry::new(GradientOp { op: layer_norm::LayerNorm { eps: 1e-3 }, input })
+            .sample(&[&[3, 5], &[5], &[5], &[3, 5]])
+            .sample(&[&[2, 4, 3], &[3], &[3], &[2, 4, 3]])
+            .sample(&[&[0, 3], &[3], &[3], &[0, 3]])
+    };
     vec![
         extremum(1, 3, true),
         extremum(0, 2, false),
@@ -237,6 +244,14 @@ fn reductions() -> Vec<Entry> {
             .sample(&[&[2, 40], &[40], &[40]])
             .sample(&[&[0, 3], &[3], &[3]])
             .sample(&[&[2, 0], &[0], &[0]]),
+        layer_norm_grad(0),
+        layer_norm_grad(1),
+        Entry::new(softmax::SOFTMAX_GRAD).sample(&[&[2, 5], &[2, 5]]).sample(&[&[0, 3], &[0, 3]]),
+        Entry::new(GradientOp { op: softmax::LogSoftmax, input: 0 }).sample(&[&[2, 5], &[2, 5]]).sample(&[&[3], &[3]]),
+        Entry::new(GradientOp { op: product::Product, input: 0 })
+            .sample(&[&[2, 4], &[2]])
+            .sample_of(vec![zeros(&[3, 4], 5).remove(0), spread(&[3], &[0.3..1.0], 1)])
+            .sample(&[&[2, 0], &[2]]),
     ]
 }
 

@@ -1,5 +1,6 @@
 //! Layer normalisation as one fused operation.
 
+use super::gradient_op::{FusedGradient, GradientOp};
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{RowUnits, layer_norm_rows, layer_norm_rows_grad};
 use raygrad_tensor::scale::power_of_two;
@@ -34,24 +35,25 @@ impl<T: Scalar> Op<T> for LayerNorm {
     }
 
     fn reads(&self) -> Reads {
-        Reads::INPUTS
+        Reads::only(&[0, 1])
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (x, gain) = (cx.x(0), cx.x(1));
-        let pool = cx.pool();
+        let (x, gain, g, pool) = (cx.x(0), cx.x(1), cx.g(), cx.pool());
+        if cx.recording() {
+            let bias = cx.constant(pool.full(cx.shape(2), T::ZERO));
+            let by = |input| cx.tape().apply(GradientOp { op: *self, input }, &[&x, &gain, &bias, g]);
+            let of_bias = cx.needs(2).then(|| g.sum_to(cx.shape(2)));
+            return Grads::new([cx.needs(0).then(|| by(0)), cx.needs(1).then(|| by(1)), of_bias]);
+        }
         let mut dx = pool.tensor(cx.shape(0));
         let are_wanted = cx.needs(1) || cx.needs(2);
         let mut sums = are_wanted.then(|| [cx.shape(1), cx.shape(2)].map(|shape| pool.tensor(shape)));
-        let [x, gain, g] = [x.value(), gain.value(), cx.g().value()].map(Tensor::as_slice);
+        let [x, gain, g] = [x.value(), gain.value(), g.value()].map(Tensor::as_slice);
         let slices = sums.as_mut().map(|sums| sums.each_mut().map(Tensor::as_mut_slice));
         layer_norm_rows_grad(x, gain, g, self.eps, dx.as_mut_slice(), slices, pool);
         let [dgain, dbias] = sums.map_or([None, None], |sums| sums.map(|sum| Some(cx.constant(sum))));
         Grads::new([Some(cx.constant(dx)), dgain, dbias])
-    }
-
-    fn is_fused(&self) -> bool {
-        true
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
@@ -67,6 +69,18 @@ impl<T: Scalar> Op<T> for LayerNorm {
         let [half, rest] = [0, 1].map(|odd| column(&|row| power((row.rest + odd) >> 1)));
         let variance = (&centred * &half * &rest).square().mean_to(&kept);
         Some(centred * half / (variance + column(&|row| row.eps)).sqrt() * &x[1] * rest + &x[2])
+    }
+}
+
+impl<T: Scalar> FusedGradient<T> for LayerNorm {
+    const GRADIENT: &'static str = "layer_norm_grad";
+
+    fn gradient(&self, input: usize, x: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        let mut grads = [x[0], x[1], x[2]].map(|x| pool.tensor(x.shape()));
+        let [dx, dgain, dbias] = grads.each_mut().map(Tensor::as_mut_slice);
+        let [x, gain, g] = [x[0], x[1], g].map(Tensor::as_slice);
+        layer_norm_rows_grad(x, gain, g, self.eps, dx, (input > 0).then_some([dgain, dbias]), pool);
+        grads.into_iter().nth(input).unwrap_or_else(|| unreachable!("there are three inputs"))
     }
 }
 

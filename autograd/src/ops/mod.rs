@@ -36,6 +36,7 @@ pub(crate) mod convolution;
 pub(crate) mod einsum;
 pub(crate) mod exponential;
 pub(crate) mod extremum;
+pub(crate) mod gradient_op;
 pub(crate) mod layer_norm;
 pub(crate) mod linear;
 pub(crate) mod loss;

@@ -1,5 +1,6 @@
 //! The product of the elements of each row, without overflow or underflow of partial products.
 
+use super::gradient_op::{FusedGradient, GradientOp};
 use super::scan::{Cumprod, Running, Walk};
 use crate::{Axes, Grads, Op, ShapeError, Var, Vjp};
 use raygrad_tensor::scale::power_of_two;
@@ -35,21 +36,29 @@ impl<T: Scalar> Op<T> for Product {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (x, g) = (cx.x(0), cx.g());
-        if cx.recording() {
-            return Grads::one(recorded(&x, g));
-        }
-        let mut out = cx.pool().tensor(x.shape());
-        let n = x.shape()[x.shape().len() - 1].max(1);
+        Grads::one(cx.tape().apply(GradientOp { op: *self, input: 0 }, &[&cx.x(0), cx.g()]))
+    }
+}
+
+impl<T: Scalar> FusedGradient<T> for Product {
+    const GRADIENT: &'static str = "prod_grad";
+
+    fn gradient(&self, _input: usize, x: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        let (x, mut out) = (x[0], pool.tensor(x[0].shape()));
+        let n = x.shape()[x.ndim() - 1].max(1);
         let mut others = Others::default();
-        let rows = x.value().as_slice().chunks_exact(n).zip(out.as_mut_slice().chunks_exact_mut(n));
-        for ((x, out), &g) in rows.zip(g.value().as_slice()) {
+        let rows = x.as_slice().chunks_exact(n).zip(out.as_mut_slice().chunks_exact_mut(n));
+        for ((x, out), &g) in rows.zip(g.as_slice()) {
             others.of(x);
             for (i, out) in out.iter_mut().enumerate() {
                 *out = T::from_f64(scaled(others.products[i], g.to_f64(), others.total - others.exponents[i]));
             }
         }
-        Grads::one(cx.constant(out))
+        out
+    }
+
+    fn recorded<'t>(&self, _input: usize, x: &[Var<'t, T>], g: &Var<'t, T>) -> Option<Var<'t, T>> {
+        Some(recorded(&x[0], g))
     }
 }
 
@@ -120,7 +129,7 @@ fn balanced<T: Scalar>(row: &[T], mut f: impl FnMut(usize, f64, i64)) {
     let mut product = 1.0;
     for (i, x) in row.iter().enumerate() {
         let x = x.to_f64();
-        if x == 0.0 || !x.is_finite() {
+        if is_special(x) {
             f(i, x, 0);
             continue;
         }
@@ -131,6 +140,11 @@ fn balanced<T: Scalar>(row: &[T], mut f: impl FnMut(usize, f64, i64)) {
         }
         f(i, factor, exponent);
     }
+}
+
+/// Whether a number has no exponent.
+fn is_special(x: f64) -> bool {
+    x == 0.0 || !x.is_finite()
 }
 
 /// A finite number other than 0 as a factor in 1..2, with its sign, and an exponent of two.
@@ -165,7 +179,7 @@ impl Unbounded {
 
     #[inline(never)]
     fn times_any(self, x: f64) -> Self {
-        if self.factor == 0.0 || x == 0.0 || !self.factor.is_finite() || !x.is_finite() {
+        if is_special(self.factor) || is_special(x) {
             return Unbounded { factor: self.factor * x, exponent: 0 };
         }
         let ((a, up), (b, up_too)) = (split(self.factor), split(x));
@@ -174,8 +188,7 @@ impl Unbounded {
 
     #[inline(never)]
     fn plus_any(self, other: Self) -> Self {
-        let is_special = |x: Self| x.factor == 0.0 || !x.factor.is_finite();
-        match (is_special(self), is_special(other)) {
+        match (is_special(self.factor), is_special(other.factor)) {
             (true, true) => return Unbounded { factor: self.factor + other.factor, exponent: 0 },
             (true, false) => return if self.factor == 0.0 { other } else { self },
             (false, true) => return if other.factor == 0.0 { self } else { other },
@@ -221,18 +234,19 @@ impl Running for Unbounded {
     }
 }
 
-/// Two numbers that differ by 1 at most and add up to `exponent`.
+/// Two numbers that differ by 1 at most and add up to `exponent`, the smaller one first.
 fn halves(exponent: i64) -> [i64; 2] {
-    [exponent / 2, exponent - exponent / 2]
+    [exponent >> 1, exponent - (exponent >> 1)]
 }
 
-/// `product * g * 2^exponent`, for a product that is near 1, 0 or not finite.
+/// `product * g * 2^exponent`, for a product that is near 1, 0 or not finite, rounded once more at most.
 fn scaled(product: f64, g: f64, exponent: i64) -> f64 {
-    if product == 0.0 || !product.is_finite() {
+    if is_special(product) || is_special(g) {
         return product * g;
     }
-    let [up, up_too] = halves(exponent).map(power_of_two);
-    product * up * g * up_too
+    let (g, of_g) = split(g);
+    let [up, up_too] = halves(exponent + of_g).map(power_of_two);
+    product * g * up * up_too
 }
 
 impl<'t, T: Scalar> Var<'t, T> {

@@ -1,5 +1,6 @@
 //! Softmax, its logarithm, and the logarithm of a sum of exponentials.
 
+use super::gradient_op::{FusedGradient, GradientOp};
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::rows;
 use raygrad_tensor::scale::power_of_two;
@@ -73,17 +74,28 @@ impl<T: Scalar> Op<T> for Softmax {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (y, g) = (cx.y(), cx.g());
-        if cx.recording() {
-            return Grads::one(in_range(g, |g| &y * (g - (g * &y).sum_over(kept_last()))));
-        }
-        let g = g.value().as_slice();
-        Grads::one(cx.constant(by_rows(y.value(), cx.pool(), |y, n, out| rows::softmax_rows_grad(y, g, n, out))))
+        Grads::one(cx.tape().apply(SOFTMAX_GRAD, &[&cx.y(), cx.g()]))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         let powers = x[0].exp();
         Some(&powers / powers.sum_over(kept_last()))
+    }
+}
+
+/// The gradient of the softmax as an operation of the *output* and its gradient.
+pub(crate) const SOFTMAX_GRAD: GradientOp<Softmax> = GradientOp { op: Softmax, input: 0 };
+
+impl<T: Scalar> FusedGradient<T> for Softmax {
+    const GRADIENT: &'static str = "softmax_grad";
+
+    fn gradient(&self, _input: usize, y: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        by_rows(y[0], pool, |y, n, out| rows::softmax_rows_grad(y, g.as_slice(), n, out))
+    }
+
+    fn recorded<'t>(&self, _input: usize, y: &[Var<'t, T>], g: &Var<'t, T>) -> Option<Var<'t, T>> {
+        let y = &y[0];
+        Some(in_range(g, |g| y * (g - (g * y).sum_over(kept_last()))))
     }
 }
 
@@ -110,17 +122,23 @@ impl<T: Scalar> Op<T> for LogSoftmax {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (x, g) = (cx.x(0), cx.g());
-        if cx.recording() {
-            return Grads::one(in_range(g, |g| g - softmax_times(&x, &g.sum_over(kept_last()))));
-        }
-        let kernel =
-            |x: &[T], n, out: &mut [T]| rows::log_softmax_rows_grad(x, g.value().as_slice(), n, out, cx.pool());
-        Grads::one(cx.constant(by_rows(x.value(), cx.pool(), kernel)))
+        Grads::one(cx.tape().apply(GradientOp { op: *self, input: 0 }, &[&cx.x(0), cx.g()]))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         Some(&x[0] - x[0].exp().sum_over(kept_last()).ln())
+    }
+}
+
+impl<T: Scalar> FusedGradient<T> for LogSoftmax {
+    const GRADIENT: &'static str = "log_softmax_grad";
+
+    fn gradient(&self, _input: usize, x: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        by_rows(x[0], pool, |x, n, out| rows::log_softmax_rows_grad(x, g.as_slice(), n, out, pool))
+    }
+
+    fn recorded<'t>(&self, _input: usize, x: &[Var<'t, T>], g: &Var<'t, T>) -> Option<Var<'t, T>> {
+        Some(in_range(g, |g| g - softmax_times(&x[0], &g.sum_over(kept_last()))))
     }
 }
 

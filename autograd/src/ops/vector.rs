@@ -1,5 +1,6 @@
 //! Vectors along the last axis: cross product and normalisation.
 
+use super::gradient_op::{FusedGradient, GradientOp};
 use crate::{Axes, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::scale::{exponent, largest, power_of_two, wide_power};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, Wide, broadcast_shape};
@@ -157,17 +158,7 @@ impl<T: Scalar> Op<T> for Normalize {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let mut grad = cx.g().value().clone();
-        let width = cx.shape(0)[cx.shape(0).len() - 1].max(1);
-        let (mut unit, mut products) = (vec![T::ZERO; width], vec![T::ZERO; width]);
-        for (x, g) in cx.x(0).value().as_slice().chunks_exact(width).zip(grad.as_mut_slice().chunks_exact_mut(width)) {
-            row_gradient(x, g, &mut unit, &mut products);
-        }
-        Grads::one(cx.constant(grad))
-    }
-
-    fn is_fused(&self) -> bool {
-        true
+        Grads::one(cx.tape().apply(GradientOp { op: *self, input: 0 }, &[&cx.x(0), cx.g()]))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
@@ -185,6 +176,20 @@ impl<T: Scalar> Op<T> for Normalize {
         let unit = &x[0] * down;
         let square = unit.square().sum_over(Axes::from(-1).keepdims());
         Some(unit / (square + one).sqrt())
+    }
+}
+
+impl<T: Scalar> FusedGradient<T> for Normalize {
+    const GRADIENT: &'static str = "normalize_grad";
+
+    fn gradient(&self, _input: usize, x: &[&Tensor<T>], g: &Tensor<T>, _pool: &Pool<T>) -> Tensor<T> {
+        let mut grad = g.clone();
+        let width = x[0].shape()[x[0].ndim() - 1].max(1);
+        let (mut unit, mut products) = (vec![T::ZERO; width], vec![T::ZERO; width]);
+        for (x, g) in x[0].as_slice().chunks_exact(width).zip(grad.as_mut_slice().chunks_exact_mut(width)) {
+            row_gradient(x, g, &mut unit, &mut products);
+        }
+        grad
     }
 }
 

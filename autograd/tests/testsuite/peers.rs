@@ -27,13 +27,18 @@ macro_rules! cases {
 }
 
 /// Operations of the catalogue without a reference, and why.
-const WITHOUT: [(&str, &str); 10] = [
+const WITHOUT: [(&str, &str); 15] = [
     ("alias", "the tape's own copy of an input, not callable from outside; it is the identity"),
     ("mul_add", "the exact sum of a product in recorded gradients, not callable from outside; tests of those cover it"),
     ("ratio", "part of the gradients of norm, var and std, not callable from outside; tests of their range cover it"),
     ("cosine", "part of recorded gradients of hypot, not callable from outside; tests of those cover it"),
     ("logistic_density", "the same of sigmoid and tanh"),
     ("cumprod_grad", "compared as the gradient of cumprod"),
+    ("layer_norm_grad", "compared as the gradient of layer_norm"),
+    ("log_softmax_grad", "compared as the gradient of log_softmax"),
+    ("normalize_grad", "compared as the gradient of normalize"),
+    ("prod_grad", "compared as the gradient of prod"),
+    ("softmax_grad", "compared as the gradient of softmax"),
     ("mean", "compared as sum.mean"),
     ("matmul_left_transposed", "compared as matmul.tn"),
     ("matmul_right_transposed", "compared as matmul.nt"),
