@@ -5,7 +5,7 @@ use raygrad::nerf::doctor::{
     DoctorOptions, Finding, FindingKind as Kind, Report, Resolution, Severity, examine, examine_cameras,
 };
 use raygrad::nerf::glam::{DAffine3, DMat3, DQuat, DVec3};
-use raygrad::nerf::{Camera, Image, Lens};
+use raygrad::nerf::{Camera, Image, Lens, Result};
 use raygrad_scenes::{Scene, embedded};
 use std::path::PathBuf;
 use std::sync::LazyLock;
@@ -72,8 +72,8 @@ impl Planted {
         self.capture.views[view].mask = Some(path);
     }
 
-    fn analysis(&self) -> Option<SceneAnalysis> {
-        self.capture.analyze_scene(self.scene_type).ok()
+    fn analysis(&self) -> Result<SceneAnalysis> {
+        self.capture.analyze_scene(self.scene_type)
     }
 
     fn cameras(&self) -> Report {
@@ -212,7 +212,7 @@ fn doctor_identifies_conventions_by_poses_alone() {
     found(&planted.cameras(), Kind::LooksAway, Warning, &[], &[Kind::CameraInBox, Kind::MissesBox]);
     let mut planted = Planted::new();
     planted.repose(|pose| pose.inverse());
-    found(&planted.cameras(), Kind::WorldToCamera, Warning, &[], &[]);
+    found(&planted.cameras(), Kind::WorldToCamera, Warning, &[], &[Kind::Refused]);
     // Points confirm it.
     let points =
         (0..100).map(|i| DVec3::new((f64::from(i) * 0.7).sin(), (f64::from(i) * 1.3).cos(), 0.01 * f64::from(i)));
@@ -345,6 +345,22 @@ fn doctor_finds_useless_masks_and_alpha() {
     );
     (0..48).for_each(|view| planted.redraw(view, opaque));
     found(&planted.report_of(ALL), Kind::OpaqueAlpha, Note, &(0..48).collect::<Vec<_>>(), &[]);
+}
+
+#[test]
+fn doctor_finds_images_that_training_refuses() {
+    let mut planted = Planted::new();
+    (0..ALL).for_each(|view| {
+        planted.redraw(view, |image| {
+            let data = image.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2], 0.5]).collect();
+            Image { data, ..image.clone() }
+        });
+    });
+    *planted.camera(2) = Camera { centre: [20.0, 80.0], ..planted.camera(2).clone() };
+    let report = planted.cameras();
+    found(&report, Kind::Refused, Error, &[], &[Kind::PrincipalPoint]);
+    assert!(report.finds(Kind::Refused).unwrap().what.contains("has alpha 128 of 255 in every pixel of `00.png`"));
+    assert!(report.finds(Kind::PrincipalPoint).is_some() && report.facts.layout.is_none());
 }
 
 #[test]

@@ -59,22 +59,13 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let files = ["cameras.png", "doctor.html"].map(|name| args.out.join(name));
     files.iter().try_for_each(|file| job.check(file))?;
     let capture = Capture::read(folder)?;
-    let (analysis, failure) = match capture.analyze_scene(args.scene_type) {
-        Ok(analysis) => (Some(analysis), None),
-        Err(failure) => (None, Some(failure)),
-    };
+    let analysis = capture.analyze_scene(args.scene_type);
     make_folder(&args.out)?;
     let progress = Progress::new();
     let show = |done: usize, total: usize| progress.count(done, total, "images checked");
     let report = examine(&capture, analysis.as_ref(), &DoctorOptions { progress: &show, ..DoctorOptions::default() });
     drop(progress);
-    // Training would fail, and the report does not say why.
-    if let Some(failure) = failure
-        && report.severity() < Some(Severity::Error)
-    {
-        return Err(failure);
-    }
-    let stage = Stage::new(&capture, analysis.as_ref(), &report);
+    let stage = Stage::new(&capture, analysis.as_ref().ok(), &report);
     let drawn = drawing::draw(&stage).map_err(|e| Error::file(&files[0], e))?;
     let page = page::page(&capture, &report, &stage, job.mark())?;
     files.iter().try_for_each(|file| job.check(file))?;
@@ -97,7 +88,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 /// Warns of problems with the cameras of a training scene, one line each.
 pub fn warn(scene: &Opened) {
     let Some((capture, analysis)) = &scene.capture else { return };
-    let Report { findings, .. } = examine_cameras(capture, Some(analysis));
+    let Report { findings, .. } = examine_cameras(capture, Ok(analysis));
     // Loading warns of absent images itself.
     let said = |finding: &Finding| finding.kind == FindingKind::ImagesAbsent;
     for Finding { kind, severity, what, .. } in findings.iter().filter(|finding| !said(finding)) {

@@ -62,6 +62,10 @@ kinds! {
     ImagesUndecodable = "images-undecodable", Error,
         "cannot decode {} (image or mask); the first: {}",
         "Copy these files again, or remove them from the capture. raygrad reads PNG, JPEG and WebP.";
+    /// Training refuses the capture, for a reason that no other finding states.
+    Refused = "refused", Error,
+        "training refuses the capture: {}",
+        "Correct this first. The other findings do not consider the scene type and the scene box.";
     /// Images differ in size from their cameras.
     ShapeMismatch = "shape-mismatch", Error,
         "the size of {} does not match the camera: {}",

@@ -19,6 +19,7 @@ pub use kinds::{FindingKind, Severity};
 pub use report::{CaptureSubset, Facts, Finding, Range, Report, Resolution, SceneLayout};
 
 use crate::dataset::{Capture, SceneAnalysis, Split, View};
+use crate::error::Error;
 use crate::numbers::median;
 use glam::DVec3;
 use pixels::Seen;
@@ -42,18 +43,18 @@ impl Default for DoctorOptions<'_> {
 
 /// Examines poses, lenses and image headers, without reading pixels.
 ///
-/// `analysis` comes from [`Capture::analyze_scene`], which fails for captures without a size. Without it, checks of the
-/// up direction and the scene box are left out.
-pub fn examine_cameras(capture: &Capture, analysis: Option<&SceneAnalysis>) -> Report {
+/// `analysis` is the result of [`Capture::analyze_scene`]. An error becomes a finding, and checks of the up direction
+/// and the scene box are left out.
+pub fn examine_cameras(capture: &Capture, analysis: Result<&SceneAnalysis, &Error>) -> Report {
     let mut findings = Findings::default();
-    let facts = without_pixels(capture, analysis, &mut findings);
-    Report { facts, findings: findings.sorted() }
+    let facts = without_pixels(capture, analysis.ok(), &mut findings);
+    Report { facts, findings: findings.sorted(analysis.err()) }
 }
 
 /// Examines everything that [`examine_cameras`] does and reads all images, in parallel.
-pub fn examine(capture: &Capture, analysis: Option<&SceneAnalysis>, options: &DoctorOptions<'_>) -> Report {
+pub fn examine(capture: &Capture, analysis: Result<&SceneAnalysis, &Error>, options: &DoctorOptions<'_>) -> Report {
     let mut findings = Findings::default();
-    let mut facts = without_pixels(capture, analysis, &mut findings);
+    let mut facts = without_pixels(capture, analysis.ok(), &mut findings);
     let looks = look::look_at_all(capture, options.progress);
     pixels::unreadable(&looks, &mut findings);
     let seen: Vec<Seen<'_>> =
@@ -61,7 +62,7 @@ pub fn examine(capture: &Capture, analysis: Option<&SceneAnalysis>, options: &Do
     pixels::examine(&seen, &mut findings);
     let compared = seen.iter().filter_map(|one| Some((one.view, one.look.picture.as_ref()?))).collect::<Vec<_>>();
     facts.agreement = consistency::examine(&compared, options.compared, &mut findings);
-    Report { facts, findings: findings.sorted() }
+    Report { facts, findings: findings.sorted(analysis.err()) }
 }
 
 fn without_pixels(capture: &Capture, analysis: Option<&SceneAnalysis>, findings: &mut Findings) -> Facts {

@@ -218,7 +218,7 @@ mod tests {
         let capture = Capture::new(folder.path(), "transforms.json".into(), Format::Transforms, views);
         let mut findings = Findings::default();
         assert_eq!(sizes(&capture, &mut findings), [([8, 6], 4)]);
-        let [found] = &findings.sorted()[..] else { panic!("not one finding") };
+        let [found] = &findings.sorted(None)[..] else { panic!("not one finding") };
         assert_eq!((found.kind, &found.views[..]), (Kind::MaskShape, &["2".to_owned(), "3".to_owned()][..]));
         assert!(found.what.ends_with("of 2 images: 8x8 pixels, the image has 8x6"), "{}", found.what);
     }
@@ -241,7 +241,7 @@ mod tests {
             let capture = Capture::new(folder.path(), "transforms.json".into(), Format::Transforms, views);
             let mut findings = Findings::default();
             assert_eq!(sizes(&capture, &mut findings), sizes_found, "{images:?}");
-            let kinds: Vec<Kind> = findings.sorted().iter().map(|finding| finding.kind).collect();
+            let kinds: Vec<Kind> = findings.sorted(None).iter().map(|finding| finding.kind).collect();
             assert_eq!(kinds, findings_found, "{images:?}");
         }
     }
@@ -267,7 +267,7 @@ mod tests {
         let seen: Vec<_> = looks.iter().map(|(view, look)| Seen { view, look: look.as_ref().unwrap() }).collect();
         let mut findings = Findings::default();
         examine(&seen, &mut findings);
-        let [found] = &findings.sorted()[..] else { panic!("not one finding") };
+        let [found] = &findings.sorted(None)[..] else { panic!("not one finding") };
         assert_eq!((found.kind, &found.views[..]), (Kind::ColorProfile, &["1".to_owned()][..]));
         assert_eq!(found.what, "cannot read the colour profile of 1 image; colours count as sRGB");
     }

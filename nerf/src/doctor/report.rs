@@ -2,6 +2,7 @@
 
 use super::kinds::{FindingKind, Severity, Text};
 use crate::dataset::{SceneType, Split, View};
+use crate::error::Error;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
@@ -167,8 +168,14 @@ impl Findings {
         }
     }
 
-    /// Sorts them: the most severe first, then in the order of their kinds.
-    pub fn sorted(mut self) -> Vec<Finding> {
+    /// Sorts them: the most severe first, then in the order of their kinds. Adds why training refuses the capture,
+    /// unless an error is found.
+    pub fn sorted(mut self, refusal: Option<&Error>) -> Vec<Finding> {
+        if let Some(error) = refusal
+            && self.0.iter().all(|finding| finding.severity < Severity::Error)
+        {
+            self.add(FindingKind::Refused, &[error]);
+        }
         self.0.sort_by_key(|finding| (std::cmp::Reverse(finding.severity), finding.kind));
         self.0
     }

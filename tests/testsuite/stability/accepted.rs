@@ -59,7 +59,7 @@ fn use_capture(folder: &Path) -> bool {
         Err(error) => return stop(error),
     };
     let analysis = capture.analyze_scene(None);
-    examine(&capture, analysis.as_ref().ok(), &DoctorOptions::default());
+    examine(&capture, analysis.as_ref(), &DoctorOptions::default());
     let out = tempfile::tempdir().unwrap();
     let at = |name: &str| {
         let folder = out.path().join(name);

@@ -29,7 +29,8 @@ fn doctor_takes_memory_in_proportion_to_equal_poses() {
     // Listing all pairs of 20 000 images took 8 GB.
     for count in [2_000, 20_000] {
         let capture = capture(count);
-        let (report, bytes) = peak(|| examine_cameras(&capture, None));
+        let analysis = capture.analyze_scene(None);
+        let (report, bytes) = peak(|| examine_cameras(&capture, analysis.as_ref()));
         assert!(bytes < 1500 * count, "{bytes} bytes for {count} photographs");
         let named: usize = report.findings.iter().map(|finding| finding.views.len()).sum();
         assert!(named <= 3 * count, "{named} names");
