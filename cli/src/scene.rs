@@ -128,7 +128,7 @@ impl Scene {
             (true, Some(_)) => SceneType::ForwardFacing,
         };
         let reason = "as in training".to_owned();
-        let analysis = SceneAnalysis { transform, scene_type, bounds, near, far, ndc, reason };
+        let analysis = SceneAnalysis { transform, scene_type, bounds, near, far, ndc, empty: None, reason };
         Ok(Opened::new(self, Some((self.capture(hold_out, description)?, analysis)), None))
     }
 

@@ -332,6 +332,9 @@ fn doctor_finds_useless_masks_and_alpha() {
     };
     (0..48).filter(|view| *view != 3).for_each(|view| planted.redraw(view, |image| opaque_over(image, 1.0)));
     assert!(planted.cameras().finds(Kind::NoAlpha).is_none(), "a white background");
+    let mut blender = planted;
+    blender.capture.format = Format::Blender;
+    assert!(blender.cameras().finds(Kind::NoAlpha).is_none(), "before white at the distance of Blender's cameras");
 
     let planted = Planted::new();
     let opaque = |image: &Image| opaque_over(image, 0.0);

@@ -8,7 +8,7 @@ use super::hold_out::split_of;
 use super::lens_mask::seen_pixels;
 use super::mask::Mask;
 use super::photo::{Header, Photo};
-use super::scene_analysis::SceneAnalysis;
+use super::scene_analysis::{EmptyBackground, SceneAnalysis};
 use super::scene_transform::SceneTransform;
 use super::scene_type::SceneType;
 use crate::camera::lens::Lens;
@@ -30,8 +30,6 @@ const LOOKED_AT: usize = 3;
 const CLEAR: f64 = 0.05;
 /// The least alpha of an opaque pixel: 8-bit rounding may leave 254 of 255.
 const OPAQUE: f32 = 0.99;
-/// The reason of a bounded scene whose images have no transparency.
-pub(crate) const BEFORE_WHITE: &str = "images show an object before white";
 /// The white share of the border from which an image shows an object in front of white.
 const WHITE_BORDER: f64 = 0.98;
 /// The largest downscale factor that is suggested.
@@ -266,10 +264,10 @@ impl Capture {
             return Err(Error::field(&self.file, &view.field, what));
         }
         let empty = match (2 * clear > total, white == total) {
-            (true, _) => Some("images have a transparent background"),
-            (_, true) => Some(BEFORE_WHITE),
+            (true, _) => Some(EmptyBackground::Transparent),
+            (_, true) => Some(EmptyBackground::White),
             // An object may fill most of the image. Blender writes an alpha channel without one, too.
-            _ if 2 * alpha > total && self.format == Format::Blender => Some("images have transparent pixels"),
+            _ if 2 * alpha > total && self.format == Format::Blender => Some(EmptyBackground::Transparent),
             _ => None,
         };
         SceneAnalysis::new(self, empty, asked)
@@ -281,7 +279,7 @@ impl Capture {
     /// # Errors
     /// As [`SceneAnalysis::new`].
     pub fn analyze_cutout(&self, asked: Option<SceneType>) -> Result<SceneAnalysis> {
-        SceneAnalysis::new(self, Some("masks cut out an object"), asked)
+        SceneAnalysis::new(self, Some(EmptyBackground::Masks), asked)
     }
 
     /// Reads one image at full size, in the orientation of its camera, without its mask.

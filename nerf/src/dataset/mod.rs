@@ -39,7 +39,7 @@ pub use mask::Mask;
 pub use photo::Photo;
 pub use photo::save::{copy_cleared, copy_upright};
 pub use photo::unsupported::heif_size;
-pub use scene_analysis::SceneAnalysis;
+pub use scene_analysis::{EmptyBackground, SceneAnalysis};
 pub use scene_transform::SceneTransform;
 pub use scene_type::SceneType;
 

@@ -28,8 +28,31 @@ pub struct SceneAnalysis {
     pub far: f64,
     /// The NDC frustum of a [forward-facing](SceneType::ForwardFacing) scene.
     pub ndc: Option<Ndc>,
+    /// Why the background seems empty, if it does.
+    pub empty: Option<EmptyBackground>,
     /// The reason for `scene_type`, in a few words.
     pub reason: String,
+}
+
+/// Why the background of a capture seems empty.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EmptyBackground {
+    /// The images have a transparent background.
+    Transparent,
+    /// The images show an object in front of white.
+    White,
+    /// Masks [cut out an object](super::LoadOptions::mask_as_alpha).
+    Masks,
+}
+
+impl EmptyBackground {
+    fn reason(self) -> &'static str {
+        match self {
+            EmptyBackground::Transparent => "images have a transparent background",
+            EmptyBackground::White => "images show an object before white",
+            EmptyBackground::Masks => "masks cut out an object",
+        }
+    }
 }
 
 /// Half of the box's side in scene units, as in the NeRF-synthetic scenes.
@@ -61,13 +84,13 @@ const ROUNDS: usize = 8;
 impl SceneAnalysis {
     /// Analyses the cameras of all images that exist.
     ///
-    /// `empty` is the reason why the background seems empty, which only pixels show; [`Capture::analyze_scene`] finds
-    /// it. `asked` overrides the type of scene.
+    /// Only pixels show whether the background is `empty`; [`Capture::analyze_scene`] finds it. `asked` overrides the
+    /// type of scene.
     ///
     /// # Errors
     /// If there is no image, if all cameras stand in one place, or if `asked` is forward-facing and the cameras are
     /// not.
-    pub fn new(capture: &Capture, empty: Option<&str>, asked: Option<SceneType>) -> Result<SceneAnalysis> {
+    pub fn new(capture: &Capture, empty: Option<EmptyBackground>, asked: Option<SceneType>) -> Result<SceneAnalysis> {
         let cameras: Vec<&Camera> = capture.present().map(|view| &view.camera).collect();
         if cameras.is_empty() {
             let Some(first) = capture.views.first() else {
@@ -93,6 +116,7 @@ impl SceneAnalysis {
                 near,
                 far,
                 ndc: None,
+                empty,
                 reason: "the NeRF-synthetic convention: all within 1.5 units of the origin".to_owned(),
             });
         }
@@ -101,7 +125,7 @@ impl SceneAnalysis {
         let points = trusted(&capture.points);
         let (scene_type, reason) = match (asked, empty) {
             (Some(scene_type), _) => (scene_type, "as requested"),
-            (None, Some(why)) => (SceneType::Bounded, why),
+            (None, Some(empty)) => (SceneType::Bounded, empty.reason()),
             (None, None) if Ndc::around(cameras.iter().copied(), 1.0).is_err() => {
                 (SceneType::Unbounded, "images are opaque, so they show a background")
             }
@@ -156,7 +180,7 @@ impl SceneAnalysis {
             }
             SceneType::Bounded | SceneType::Unbounded => None,
         };
-        Ok(SceneAnalysis { transform, scene_type, bounds: BOX, near, far, ndc, reason })
+        Ok(SceneAnalysis { transform, scene_type, bounds: BOX, near, far, ndc, empty, reason })
     }
 }
 

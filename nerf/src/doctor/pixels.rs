@@ -3,8 +3,8 @@
 use super::kinds::{FindingKind as Kind, Severity};
 use super::look::Look;
 use super::report::Findings;
-use crate::dataset::load::{BEFORE_WHITE, mask_fits, same_shape};
-use crate::dataset::{Capture, Photo, SceneAnalysis, SceneType, Split, View};
+use crate::dataset::load::{mask_fits, same_shape};
+use crate::dataset::{Capture, EmptyBackground, Photo, SceneAnalysis, SceneType, Split, View};
 use crate::error::Result;
 use crate::numbers::{median, spread};
 use std::collections::{HashMap, HashSet};
@@ -64,7 +64,7 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
 /// Adds a finding about images without an alpha channel among those that show an object on a transparent background.
 pub(super) fn without_alpha(capture: &Capture, analysis: Option<&SceneAnalysis>, findings: &mut Findings) {
     let is_cut = |analysis: &&SceneAnalysis| {
-        analysis.scene_type == SceneType::Bounded && !analysis.reason.starts_with(BEFORE_WHITE)
+        analysis.scene_type == SceneType::Bounded && analysis.empty == Some(EmptyBackground::Transparent)
     };
     if analysis.filter(is_cut).is_none() {
         return;
@@ -181,10 +181,7 @@ fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
         && with(true).next().is_some()
     {
         finding.severity = Severity::Warning;
-        finding.advice =
-            "Save these with a transparent background as the others are, or training learns their background as \
-            part of the scene."
-                .to_owned();
+        finding.advice = Kind::NoAlpha.text().advice.to_owned();
     }
 }
 

@@ -101,7 +101,7 @@ fn parallel_cameras_put_the_centre_ahead() {
             ..analysis
         }
     );
-    assert_eq!(SceneAnalysis::new(&wall, Some("it is"), None).unwrap().scene_type, SceneType::Bounded);
+    assert_eq!(SceneAnalysis::new(&wall, Some(EmptyBackground::White), None).unwrap().scene_type, SceneType::Bounded);
     let place = |i: usize| DVec3::new(0.2 + 0.1 * (i as f64).sin(), 4.0, 0.0);
     wall.points = (0..150).map(|i| Point { position: place(i), color: [0; 3], error: 1.0, views: 3 }).collect();
     let analysis = SceneAnalysis::new(&wall, None, None).unwrap();
@@ -201,7 +201,8 @@ fn bounded_scene_is_as_wide_as_cameras_see() {
     let eyes = [DVec3::new(3.0, 0.0, 0.0), DVec3::new(0.0, 4.0, 0.0), DVec3::new(-8.0, 0.0, 0.0)];
     let cameras = eyes.map(|eye| camera(eye, DVec3::ZERO, DVec3::Z));
     let analysis =
-        SceneAnalysis::new(&capture(Format::Transforms, cameras.to_vec()), Some("it is transparent"), None).unwrap();
+        SceneAnalysis::new(&capture(Format::Transforms, cameras.to_vec()), Some(EmptyBackground::Transparent), None)
+            .unwrap();
     assert_eq!(analysis.scene_type, SceneType::Bounded);
     // Half of 300 rows over a focal length of 250 is more than half of 400 columns over 500: 0.6 of the distance 4.
     let half = 1.5 / analysis.transform.scale;
@@ -220,7 +221,7 @@ fn near_and_far_of_bounded_scenes_hold_the_box() {
             radius * DVec3::new(0.8 * cos, 0.8 * sin, 0.6)
         };
         let cameras = (0..9).map(|i| camera(eye(i), DVec3::ZERO, DVec3::Z)).collect();
-        SceneAnalysis::new(&capture(Format::Blender, cameras), Some("it is transparent"), None).unwrap()
+        SceneAnalysis::new(&capture(Format::Blender, cameras), Some(EmptyBackground::Transparent), None).unwrap()
     };
     // Lego-like, near, and beyond the convention.
     for radius in [4.0, 2.6, 9.0] {
@@ -245,7 +246,7 @@ fn near_and_far_of_bounded_scenes_hold_the_box() {
     // Some of the box is visible from inside.
     let mut inside = capture(Format::Transforms, quarter(4.0));
     inside.views[0].camera.pose.translation = CENTRE + DVec3::new(0.1, 0.2, 0.3);
-    let inside = SceneAnalysis::new(&inside, Some("it is transparent"), None).unwrap();
+    let inside = SceneAnalysis::new(&inside, Some(EmptyBackground::Transparent), None).unwrap();
     assert!((0.001..0.1).contains(&inside.near), "{}", inside.near);
 }
 
@@ -346,16 +347,18 @@ fn scene_type_flag_beats_convention_beats_alpha() {
     // Opaque images show a background, wherever their cameras are.
     assert_eq!(SceneAnalysis::new(&around(4.0), None, None).unwrap().scene_type, SceneType::Unbounded);
     let asked = SceneAnalysis::new(&around(4.0), None, Some(SceneType::Bounded)).unwrap();
-    let conventional = SceneAnalysis::new(&around(4.0), Some("it is transparent"), None).unwrap();
-    assert_eq!(asked, conventional);
+    let conventional = SceneAnalysis::new(&around(4.0), Some(EmptyBackground::Transparent), None).unwrap();
+    assert_eq!(SceneAnalysis { empty: Some(EmptyBackground::Transparent), ..asked }, conventional);
     assert_eq!(conventional.transform, SceneTransform::default());
     assert_eq!(conventional.scene_type, SceneType::Bounded);
     assert_eq!(
-        SceneAnalysis::new(&around(4.0), Some("it is transparent"), Some(SceneType::Unbounded)).unwrap().scene_type,
+        SceneAnalysis::new(&around(4.0), Some(EmptyBackground::Transparent), Some(SceneType::Unbounded))
+            .unwrap()
+            .scene_type,
         SceneType::Unbounded
     );
     for radius in [2.4, 5.6] {
-        let other = SceneAnalysis::new(&around(radius), Some("it is transparent"), None).unwrap();
+        let other = SceneAnalysis::new(&around(radius), Some(EmptyBackground::Transparent), None).unwrap();
         assert!(other.transform != SceneTransform::default() && other.scene_type == SceneType::Bounded, "{radius}");
         assert_eq!(SceneAnalysis::new(&around(radius), None, None).unwrap().scene_type, SceneType::Unbounded);
     }
