@@ -1,8 +1,10 @@
 //! Near and far depth of images, for LLFF.
 
 use raygrad::nerf::Result;
-use raygrad::nerf::dataset::{Capture, Point, View};
+use raygrad::nerf::dataset::{Capture, Point, SceneAnalysis, View};
 use raygrad::nerf::glam::DVec3;
+
+use crate::output::complain;
 
 /// Fewest points of an image for an estimate of its depths.
 const FEWEST: usize = 20;
@@ -19,7 +21,15 @@ pub fn of(capture: &Capture) -> Result<(Vec<[f64; 2]>, usize)> {
     if guessed == 0 {
         return Ok((found.into_iter().flatten().collect(), 0));
     }
-    let analysis = capture.analyze_scene(None)?;
+    let analysis = match capture.analyze_scene(None) {
+        Ok(analysis) => analysis,
+        // Training refuses the images, but the cameras have a scene box.
+        Err(error) => {
+            let analysis = SceneAnalysis::new(capture, None, None)?;
+            complain(&format!("warning: {error}"));
+            analysis
+        }
+    };
     let transform = analysis.transform;
     let reach = analysis.bounds[0].distance(analysis.bounds[1]) * 0.5 / transform.scale;
     let middle = transform.point_back(0.5 * (analysis.bounds[0] + analysis.bounds[1]));

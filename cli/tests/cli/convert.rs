@@ -442,3 +442,24 @@ fn captures_are_found_from_within_their_folders() {
         assert!(to.join("images/more/8.png").is_file(), "{folder}, {name}: folders tell images apart");
     }
 }
+
+#[test]
+fn images_that_training_refuses_are_converted_to_llff() {
+    let place = Place::with_scene();
+    for split in Split::ALL {
+        for view in Capture::read(place.path("scene")).unwrap().split(split).unwrap() {
+            let path = view.image.as_ref().unwrap();
+            let image = Photo::open(path, None).unwrap().to_image();
+            let data = image.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2], 0.5]).collect();
+            Image { data, ..image }.save_png(path).unwrap();
+        }
+    }
+    let what = "has alpha 128 of 255 in every pixel of `";
+    place.fails(&format!("train scene --steps 1 {CLASSIC}"), &[what]);
+    for (format, warns) in [("llff", true), ("nerfstudio", false)] {
+        let output = place.command(&format!("prepare scene --to {format} --out {format}")).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success() && said.contains(what) == warns, "{format}: {said}");
+        assert_eq!(read(&place, format).present().count(), 11);
+    }
+}
