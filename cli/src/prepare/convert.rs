@@ -370,8 +370,8 @@ fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> 
         to.mask_is_dynamic = false;
         to.mask = view.mask.as_ref().filter(|_| has_masks).map(|_| folder.join("masks").join(format!("{inner}.png")));
         to.depth = view.depth.as_ref().filter(|_| has_depths).map(|(path, unit)| {
-            let ending = path.extension().unwrap_or_default();
-            (folder.join("depths").join(inner).with_extension(ending), *unit)
+            let ending = path.extension().unwrap_or_default().to_string_lossy();
+            (folder.join("depths").join(format!("{inner}.{ending}")), *unit)
         });
         jobs.push(Job { from: view.clone(), to, seen_by: None });
     }

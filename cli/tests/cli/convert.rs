@@ -463,3 +463,39 @@ fn images_that_training_refuses_are_converted_to_llff() {
         assert_eq!(read(&place, format).present().count(), 11);
     }
 }
+
+#[test]
+fn images_with_one_stem_and_two_endings_stay_apart() {
+    let place = Place::with_scene();
+    let mut transforms = place.transforms(Split::Train);
+    let jpeg = Photo::open(place.path("scene/train/r_1.png"), None).unwrap().over([1.0; 3]);
+    std::fs::remove_file(place.path("scene/train/r_1.png")).unwrap();
+    Photo::from(jpeg).save(place.path("scene/train/r_0.jpg")).unwrap();
+    transforms["frames"][1]["file_path"] = "./train/r_0.jpg".into();
+    for (frame, depth) in [(0, 0.25), (1, 0.5)] {
+        let name = format!("depth{frame}.png");
+        let depth = Image { width: 4, height: 4, channels: 1, data: vec![depth; 16] };
+        depth.save_png(place.path(&format!("scene/{name}"))).unwrap();
+        transforms["frames"][frame]["depth_file_path"] = name.into();
+    }
+    transforms["depth_unit_scale_factor"] = json!(0.1);
+    place.write_transforms(Split::Train, &transforms);
+    for format in ["blender", "nerfstudio", "colmap", "llff"] {
+        place.succeeds(&format!("prepare scene --to {format} --out {format}"));
+        let capture = read(&place, format);
+        assert_eq!(capture.present().count(), 11, "{format}");
+        for ending in ["png", "jpg"] {
+            let views = capture.views.iter().filter_map(|view| view.image.as_ref().map(|image| (view, image)));
+            let mut own = views.filter(|(_, image)| {
+                image.to_str().unwrap().contains(&format!("train_r_0.{ending}"))
+                    || image.ends_with(format!("train/r_0.{ending}"))
+            });
+            let (view, image) = own.next().unwrap();
+            let from = std::fs::read(place.path(&format!("scene/train/r_0.{ending}"))).unwrap();
+            assert!(own.next().is_none() && std::fs::read(image).unwrap() == from, "{format} {ending}");
+            let Some((depth, _)) = &view.depth else { continue };
+            let frame = usize::from(ending == "jpg");
+            assert!(std::fs::read(depth).unwrap() == place.bytes(&format!("scene/depth{frame}.png")), "{ending}");
+        }
+    }
+}

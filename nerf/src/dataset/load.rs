@@ -526,7 +526,9 @@ fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize
         return (path.to_owned(), downscale);
     }
     let other = folder.join(format!("images_{downscale}")).join(parts.as_path());
-    let endings = ["png", "jpg", "JPG", "jpeg", "webp"].map(|ending| other.with_extension(ending));
+    // An image of that name has a copy of its own.
+    let endings = ["png", "jpg", "JPG", "jpeg", "webp"].into_iter().filter(|end| !path.with_extension(end).is_file());
+    let endings: Vec<PathBuf> = endings.map(|ending| other.with_extension(ending)).collect();
     let found = [other].into_iter().chain(endings).find(|path| path.is_file());
     found.map_or_else(|| (path.to_owned(), downscale), |path| (path, 1))
 }

@@ -52,7 +52,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
         let place = if place.is_empty() { format!("beside `{FILE}`") } else { format!("of `{place}`") };
         capture.assumptions.push(format!("there are no images in `images`: used those {place}"));
     }
-    masks::attach(&mut capture, &[folder.to_owned()]);
+    masks::attach(&mut capture, &[folder.to_owned()])?;
     Ok(capture)
 }
 

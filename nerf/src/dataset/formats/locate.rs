@@ -7,7 +7,7 @@
 use super::paths::{self, any_extension, composed, extension, folded};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::fs::{DirEntry, FileType};
 use std::path::{Component, Path, PathBuf};
 
@@ -47,11 +47,13 @@ pub(super) fn locate(
     assumptions: &mut Vec<String>,
 ) -> Result<Vec<Option<Located>>, Ambiguity> {
     let mut listings: HashMap<&str, Directory> = HashMap::new();
+    let all: HashSet<&str> = names.iter().copied().collect();
     for (i, name) in names.iter().enumerate().filter(|(_, name)| any_extension(name).is_none()) {
         let [place, last] = split(name);
         let directory = listings.entry(place).or_insert_with(|| Directory::read(folder, Path::new(place)));
-        if let [one, two, ..] = &directory.with_ending(last)[..] {
-            let [one, two] = [one, two].map(|file| directory.inside.join(file).display().to_string());
+        let files =
+            directory.with_ending(last).into_iter().map(|file| directory.inside.join(file).display().to_string());
+        if let [one, two, ..] = &files.filter(|file| !all.contains(file.as_str())).collect::<Vec<_>>()[..] {
             return Err((i, format!("`{name}` has no ending, and `{one}` and `{two}` fit: write the ending")));
         }
     }
@@ -80,10 +82,13 @@ pub(super) fn locate(
             tree.get_or_insert_with(|| Tree::new(folder)).best(place, &names)
         };
         let (mut first, mut count) = (None, 0);
+        let own: HashSet<&OsStr> = group.iter().map(|&i| listed[i][1].as_ref()).collect();
         for i in group {
             let of = |directory: &'_ Directory| -> Option<(usize, Vec<PathBuf>)> {
                 let (rule, files) = directory.of(listed[i][1], !is_there)?;
-                let files = files.into_iter().map(|file| directory.inside.join(file));
+                // A file with another's exact name is that one's.
+                let files = files.into_iter().filter(|file| *file == listed[i][1] || !own.contains(file.as_os_str()));
+                let files = files.map(|file| directory.inside.join(file));
                 Some((rule, files.filter(|file| is_free(&folder.join(file))).collect()))
             };
             let rated: Vec<(usize, Vec<PathBuf>)> = directories.iter().filter_map(|directory| of(directory)).collect();
@@ -254,7 +259,7 @@ fn is_file(entry: &DirEntry) -> bool {
     entry.file_type().is_ok_and(|kind| kind.is_file() || kind.is_symlink() && entry.path().is_file())
 }
 
-fn is_hidden(name: &std::ffi::OsStr) -> bool {
+fn is_hidden(name: &OsStr) -> bool {
     name.as_encoded_bytes().starts_with(b".")
 }
 

@@ -3,6 +3,7 @@
 use super::locate::{folders, stem};
 use super::paths::{extension, folded};
 use crate::dataset::capture::{Capture, View};
+use crate::error::{Error, Result};
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
@@ -10,9 +11,14 @@ use std::path::{Path, PathBuf};
 const FOLDERS: [&str; 2] = ["masks", "mask"];
 
 /// Sets the masks of views that have one in a mask folder of `roots`. An assumption says if only some have one.
-pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) {
+///
+/// # Errors
+/// If a mask fits two images.
+pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) -> Result<()> {
     let folders: Vec<PathBuf> = roots.iter().flat_map(|root| folders(root, &FOLDERS)).collect();
-    let Some(name) = folders.first().and_then(|folder| folder.file_name()).map(Path::new) else { return };
+    let Some(name) = folders.first().and_then(|folder| folder.file_name()).map(Path::new) else {
+        return Ok(());
+    };
     let mut listings = HashMap::new();
     for view in &mut capture.views {
         // COLMAP's own naming comes first.
@@ -24,6 +30,16 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) {
         let exact = paths.clone().find(|path| path.is_file());
         view.mask = exact.or_else(|| paths.find_map(|path| in_any_case(&mut listings, &path)));
     }
+    let mut owners: HashMap<&Path, &View> = HashMap::new();
+    for view in capture.present() {
+        let Some(mask) = &view.mask else { continue };
+        let first = *owners.entry(mask).or_insert(view);
+        if first.image != view.image {
+            let (mask, [one, two]) = (mask.display(), [first, view].map(|view| &view.name));
+            let what = format!("has a mask that also fits `{one}`, {mask}: name masks `{one}.png` and `{two}.png`");
+            return Err(Error::field(&capture.file, &view.field, what));
+        }
+    }
     let present = capture.present().count();
     let masked = capture.present().filter(|view| view.mask.is_some()).count();
     if masked < present {
@@ -31,6 +47,7 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) {
         let what = format!("{masked} of {present} images have a mask in `{name}`; the others use all pixels");
         capture.assumptions.push(what);
     }
+    Ok(())
 }
 
 /// The start of the names of instant-ngp's dynamic masks.
@@ -130,7 +147,7 @@ mod tests {
             capture.views[0].name = name.into();
             let mask = folder.path().join("masks").join(mask);
             picture(&mask, 8, 6);
-            attach(&mut capture, &[folder.path().to_owned()]);
+            attach(&mut capture, &[folder.path().to_owned()]).unwrap();
             assert_eq!((capture.views[0].mask.as_ref(), capture.assumptions.len()), (Some(&mask), 0), "{name}");
         }
     }
@@ -141,7 +158,7 @@ mod tests {
             let folder = tempfile::tempdir().unwrap();
             let mut capture = picture_with_camera(folder.path());
             places.iter().for_each(|place| picture(&folder.path().join(place).join("0.png"), 8, 6));
-            attach(&mut capture, &[folder.path().to_owned()]);
+            attach(&mut capture, &[folder.path().to_owned()]).unwrap();
             let mask = capture.views.remove(0).mask?;
             Some(mask.parent()?.file_name()?.to_str()?.to_owned())
         };
@@ -154,6 +171,25 @@ mod tests {
         ] {
             assert_eq!(found(places).as_deref(), expected, "{places:?}");
         }
+    }
+
+    #[test]
+    fn masks_that_fit_two_images_are_refused() {
+        let check = |masks: &[&str]| {
+            let folder = tempfile::tempdir().unwrap();
+            let mut capture = picture_with_camera(folder.path());
+            let image = folder.path().join("images/0.jpg");
+            capture.views.push(View { name: "0.jpg".into(), image: Some(image), ..capture.views[0].clone() });
+            masks.iter().for_each(|mask| picture(&folder.path().join("masks").join(mask), 8, 6));
+            attach(&mut capture, &[folder.path().to_owned()]).map_err(|error| error.to_string())?;
+            let name = |view: &View| Some(view.mask.as_ref()?.file_name()?.to_str()?.to_owned());
+            Ok::<_, String>(capture.views.iter().map(name).collect::<Vec<_>>())
+        };
+        let message = check(&["0.png"]).unwrap_err();
+        assert!(message.contains("has a mask that also fits `0.png`, ") && message.contains("masks/0.png: name masks"));
+        assert!(message.ends_with("`0.png.png` and `0.jpg.png`"), "{message}");
+        let [own, other] = ["0.png", "0.jpg.png"].map(|name| Some(name.to_owned()));
+        assert_eq!(check(&["0.png", "0.jpg.png"]), Ok(vec![own, other]));
     }
 
     /// The file name of each view's dynamic mask, and the notes, of images and masks with these names.

@@ -170,6 +170,13 @@ fn downscaled_image_folders_are_used() {
     let data = capture.load(Split::Train, &analysis, &LoadOptions { downscale: 4, ..LoadOptions::default() }).unwrap();
     assert!(data.frames[0].name == "images/01.png" && data.frames[0].image.to_image() == small);
     assert_eq!([data.frames[1].image.width, data.frames[1].image.height], [3, 2]);
+    // A copy in another format, unless it is that of another image.
+    let [own, other] = ["images/03.png", "images/03.jpg"].map(|name| folder.path().join(name));
+    let copy = folder.path().join("images_4/03.jpg");
+    std::fs::write(&copy, "").unwrap();
+    assert_eq!(made_smaller(folder.path(), &own, 4), (copy, 1));
+    std::fs::write(other, "").unwrap();
+    assert_eq!(made_smaller(folder.path(), &own, 4), (own, 4));
     let alone = Path::new("scene/images_4/a/01.png");
     assert_eq!(made_smaller(Path::new("scene"), alone, 8), (alone.to_owned(), 2));
     assert_eq!(made_smaller(Path::new("scene"), alone, 4), (alone.to_owned(), 1));

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 /// Sets the existing image and mask of each view. `model` is the folder of the model.
 ///
 /// # Errors
-/// If two files fit the name of an image.
+/// If two files fit the name of an image, or a mask fits two images.
 pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     let root = if model == capture.folder { root(model) } else { capture.folder.clone() };
     // All images come from one folder, since others may hold the same names at another size. Names may also be relative
@@ -40,8 +40,7 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     let found = locate(&folder, &names, &HashSet::new(), &mut capture.assumptions);
     let found = found.map_err(|(i, what)| Error::field(&capture.file, &capture.views[i].field, what))?;
     capture.views.iter_mut().zip(found).for_each(|(view, image)| view.image = image.map(|image| image.path));
-    masks::attach(capture, &[root]);
-    Ok(())
+    masks::attach(capture, &[root])
 }
 
 /// The fullest of `others` and a note, if `folder` is a stale copy of it: with less than half of the files of these

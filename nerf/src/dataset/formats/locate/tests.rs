@@ -125,6 +125,9 @@ fn ambiguous_files_are_refused() {
         found(&["a/0.png", "a/1.png", "b/1.png", "b/0.png"], &["x/2.png", "y/0.png", "y/1.png"]).unwrap_err().0,
         1
     );
+    // A file with another's exact name is no copy in another format.
+    finds(&["photos/0.png"], &["images/0.jpg", "images/0.png"], &["", "photos/0.png"]);
+    finds(&["photos/a.png"], &["images/a.png", "images/A.png"], &["photos/a.png", ""]);
     // A folder without a common part must hold most names.
     finds(&["a/0.png", "b/1.png"], &["x/0.png", "x/1.png"], &["", ""]);
     finds(&["x/a/0.png", "x/b/1.png"], &["y/a/0.png", "y/a/2.png"], &["x/a/0.png", ""]);
@@ -183,7 +186,7 @@ fn assumptions_name_the_first_file_and_count_the_others() {
 fn names_that_are_not_utf8_and_links_are_found() {
     use std::os::unix::ffi::OsStrExt;
     let (_parent, folder) = scene(&["images/0.png"]);
-    let name = std::ffi::OsStr::from_bytes(b"caf\xe9.jpg");
+    let name = OsStr::from_bytes(b"caf\xe9.jpg");
     std::fs::write(folder.join("images").join(name), b"").unwrap();
     let located = locate(&folder, &["images/0.png", "images/caf\u{fffd}.jpg"], &HashSet::new(), &mut vec![]).unwrap();
     assert_eq!(located[1].as_ref().unwrap().path, folder.join("images").join(name));
@@ -213,6 +216,9 @@ fn names_without_ending_fit_one_format() {
     let expected = "`images/0` has no ending, and `images/0.jpg` and `images/0.png` fit: write the ending";
     refuses(&["images/0.jpg", "images/0.png"], &["images/0"], &[expected]);
     finds(&["images/0.jpg", "images/0.png"], &["images/0.jpg"], &["images/0.jpg"]);
+    // As `raygrad prepare` writes them in Blender's format, whose names lack `.png`.
+    let (paths, _) = found(&["0.jpg", "0.png"], &["0.jpg", "0"]).unwrap();
+    assert_eq!(paths, [Some("0.jpg".to_owned()), Some("0.png".to_owned())]);
     finds(&["images/0", "images/0.jpg", "images/0.png"], &["images/0"], &["images/0"]);
 }
 
