@@ -2,6 +2,7 @@
 
 use super::locate::{shown, walk};
 use super::{blender, colmap, llff, transforms};
+use crate::camera::lens::Lens;
 use crate::dataset::capture::{Capture, Format};
 use crate::dataset::frames::Split;
 use crate::error::{Error, Result};
@@ -33,7 +34,7 @@ const EXPORTS: [(&str, &str, &str); 18] = [
 const ARCHIVES: [&str; 7] = ["zip", "r3d", "7z", "rar", "tar", "gz", "tgz"];
 
 /// The deepest folder that is searched for a description in an unusual place.
-const DEEPEST: usize = 3;
+const DEEPEST: usize = 4;
 
 /// The files that describe a capture.
 #[derive(Debug, Clone, PartialEq)]
@@ -216,8 +217,22 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
     }
     check_single(path, &all)?;
     let mut capture = most_complete(&all, needed)?;
-    let what = format!("the usual places hold no capture: used `{}`", below(path, &capture.file));
-    capture.assumptions.insert(0, what);
+    let model = below(path, &capture.file);
+    if capture.format == Format::Colmap && capture.present().next().is_none() {
+        let around = colmap::read_model(path, &capture.file)?;
+        let first = around.present().next().and_then(|view| Some(below(path, view.image.as_ref()?)));
+        // Undistorted models have images of their own.
+        let is_undistorted = around.views.iter().all(|view| view.camera.lens == Lens::Pinhole);
+        match first {
+            Some(image) if is_undistorted => capture.assumptions.push(format!(
+                "`{image}` is not beside `{model}`, which may have undistorted images of its own: to use these images, \
+                 move the model to `sparse/0`"
+            )),
+            Some(_) => capture = around,
+            None => {}
+        }
+    }
+    capture.assumptions.insert(0, format!("the usual places hold no capture: used `{model}`"));
     Ok(capture)
 }
 

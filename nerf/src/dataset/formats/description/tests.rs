@@ -204,7 +204,9 @@ fn captures_are_found_in_unusual_places() {
         // As a run keeps it.
         assert_eq!(read_file(&capture.folder, &path.join(file), true).unwrap().present().count(), 3);
     };
-    for place in ["colmap_sparse/0", "colmap_text", "colmap/sparse", "colmap", "sparse/model", "Sparse/0", "a/b/c"] {
+    for place in
+        ["colmap_sparse/0", "colmap_text", "colmap/sparse", "colmap", "sparse/model", "Sparse/0", "a/b/c", "a/b/c/d"]
+    {
         let files = ["cameras.bin", "images.bin"].map(|name| [format!("sparse/0/{name}"), format!("{place}/{name}")]);
         let folder = moved(Format::Colmap, &files.each_ref().map(|[from, to]| (from.as_str(), to.as_str())));
         check(&folder, &format!("{place}/images.bin"), "");
@@ -216,9 +218,25 @@ fn captures_are_found_in_unusual_places() {
             ["cameras.bin", "images.bin"].map(|name| [format!("sparse/0/{name}"), format!("{place}/sparse/{name}")]);
         let folder = moved(Format::Colmap, &files.each_ref().map(|[from, to]| (from.as_str(), to.as_str())));
         let path = folder.path();
-        assert_eq!(read(path, None).unwrap().present().count(), 0, "images of other cameras");
+        let capture = read(path, None).unwrap();
+        assert_eq!(capture.present().count(), 0, "images of other cameras");
+        let note =
+            format!("`images/0.png` is not beside `{place}/sparse/images.bin`, which may have undistorted images");
+        assert!(capture.assumptions[1].starts_with(&note), "{:?}", capture.assumptions);
         std::fs::rename(path.join("images"), path.join(place).join("images")).unwrap();
         check(&folder, &format!("{place}/sparse/images.bin"), place);
+    }
+    // A model with distortion, whose images are those beside its folder.
+    for place in ["output/sparse/0", "output/colmap/sparse", "colmap/sparse/0/refined"] {
+        let files = ["cameras.bin", "images.bin"].map(|name| [format!("sparse/0/{name}"), format!("{place}/{name}")]);
+        let folder = moved(Format::Colmap, &files.each_ref().map(|[from, to]| (from.as_str(), to.as_str())));
+        let cameras = folder.path().join(place).join("cameras.bin");
+        let mut bytes = std::fs::read(&cameras).unwrap();
+        // One camera of COLMAP's model OPENCV, which has four more parameters.
+        bytes[12] = 4;
+        bytes.extend([0.1, 0.0, 0.0, 0.0].map(f64::to_le_bytes).concat());
+        std::fs::write(&cameras, bytes).unwrap();
+        check(&folder, &format!("{place}/images.bin"), "");
     }
     for name in ["Transforms.json", "transform.json", "transforms.json.txt"] {
         check(&moved(Format::Transforms, &[("transforms.json", name)]), name, "");
@@ -256,7 +274,7 @@ fn several_captures_in_unusual_places_are_named() {
     assert!(read(path, None).unwrap_err().to_string().contains("`b/transforms.json`, `b/transforms_2.json`: name"));
     // Hidden folders, deeper ones and other files.
     let places =
-        [".cache/transforms.json", "a/b/c/d/transforms.json", "dataparser_transforms.json", "transform_2.json"];
+        [".cache/transforms.json", "a/b/c/d/e/transforms.json", "dataparser_transforms.json", "transform_2.json"];
     for place in places {
         let folder = moved(Format::Transforms, &[("transforms.json", place)]);
         assert!(read(folder.path(), None).unwrap_err().to_string().contains("is not a dataset"), "{place}");
