@@ -1,9 +1,10 @@
 //! The frames of a JSON file as views.
 
-use super::intrinsics::{check_finite, check_known};
+use super::intrinsics::{check_known, check_lengths};
 use super::json::{Object, first_of, unused};
 use super::layers::Layers;
 use super::locate::{Located, locate};
+use super::points::reason;
 use super::{masks, matrix, paths};
 use crate::dataset::capture::View;
 use crate::dataset::photo::Photo;
@@ -38,8 +39,8 @@ pub(super) struct Frames {
     pub(super) views: Vec<Vec<View>>,
     /// Names of frames without a usable camera, which were left out.
     pub(super) left_out: HashSet<String>,
-    /// The error of the first of them.
-    error: Option<Error>,
+    /// The name and error of the first of them.
+    error: Option<(String, Error)>,
     /// Sentences about files found elsewhere, and frames left out.
     pub(super) assumptions: Vec<String>,
 }
@@ -72,14 +73,14 @@ impl Frames {
             let views = out.document(top, frames, &images, (folder, &taken), dialect)?;
             out.views.push(views);
         }
-        if let Some(name) = out.left_out.iter().min() {
+        if let Some((name, error)) = out.error.take() {
             // Images that are mostly left out make a bad scene.
-            if let Some(error) = out.error.take().filter(|_| 2 * out.left_out.len() >= all.len()) {
+            if 2 * out.left_out.len() >= all.len() {
                 return Err(error);
             }
-            let (count, total) = (out.left_out.len(), all.len());
+            let (count, total, why) = (out.left_out.len(), all.len(), reason(error));
             out.assumptions
-                .push(format!("left out {count} of {total} frames without a usable camera, such as `{name}`"));
+                .push(format!("left out {count} of {total} frames without a usable camera, such as `{name}`: {why}"));
         }
         out.assumptions.extend(moving(&all));
         out.assumptions.extend(masks::attach_dynamic(&mut out.views.iter_mut().flatten().collect::<Vec<_>>()));
@@ -104,11 +105,11 @@ impl Frames {
         let (mut rounded, mut blunt, mut shared) = (vec![], vec![], vec![]);
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
             check_known(frame)?;
-            let pose = matrix::pose(frame, "transform_matrix")?.and_then(|pose| check_finite(frame).map(|()| pose));
+            let pose = matrix::pose(frame, "transform_matrix")?.and_then(|pose| check_lengths(frame).map(|()| pose));
             let mut pose = match pose {
                 Ok(pose) => pose,
                 Err(error) => {
-                    self.error.get_or_insert(error);
+                    self.error.get_or_insert_with(|| (name.clone(), error));
                     self.left_out.insert(name.clone());
                     continue;
                 }

@@ -94,14 +94,17 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     Err(object.error(name, format!("is {}, which raygrad does not read: {what}", shown(value))))
 }
 
-/// Checks that a frame's own lengths are finite. Those of images without a pose are not, in some files.
+/// Checks that a frame's own lengths are finite, and its focal lengths above 0. Those of images without a pose are not,
+/// in some files.
 ///
 /// # Errors
-/// If one is not finite.
-pub(super) fn check_finite(frame: &Object<'_>) -> Result<()> {
+/// If one is not.
+pub(super) fn check_lengths(frame: &Object<'_>) -> Result<()> {
     for name in ["fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"] {
-        if frame.get(name).and_then(number).is_some_and(|x| !x.is_finite()) {
-            frame.number(name)?;
+        match frame.get(name).and_then(number) {
+            Some(x) if !x.is_finite() => _ = frame.number(name)?,
+            Some(_) if name.starts_with("fl") => _ = frame.positive(name)?,
+            _ => {}
         }
     }
     Ok(())

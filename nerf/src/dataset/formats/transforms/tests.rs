@@ -91,12 +91,14 @@ fn invalid_poses_are_named() {
         std::fs::write(folder.path().join(FILE), text.replacen("4.0", value, 1)).unwrap();
         let capture = read(folder.path()).unwrap();
         assert_eq!((capture.views.len(), capture.views[0].name.as_str()), (2, "images/1.png"));
-        let expected = "left out 1 of 3 frames without a usable camera, such as `images/0.png`";
+        let what = format!("row 2, column 3 is not a finite number: \"{value}\"");
+        let expected = format!(
+            "left out 1 of 3 frames without a usable camera, such as `images/0.png`: `frames[0].transform_matrix`: {what}"
+        );
         assert_eq!(capture.assumptions, [expected]);
         // Most frames must be whole.
         std::fs::write(folder.path().join(FILE), text.replacen("4.0", value, 2)).unwrap();
-        let expected = format!("row 2, column 3 is not a finite number: \"{value}\"");
-        says(&failure(read(folder.path()), FILE), &["`frames[0].transform_matrix`", &expected]);
+        says(&failure(read(folder.path()), FILE), &["`frames[0].transform_matrix`", &what]);
     }
     assert!(
         good(|d| d["frames"][1]["transform_matrix"] = with(0, 1, 1e-4)).views[1].camera.pose.matrix3.y_axis.x == 1e-4
@@ -105,20 +107,32 @@ fn invalid_poses_are_named() {
 
 #[test]
 fn frames_without_a_pose_are_left_out() {
-    let expected = "left out 1 of 3 frames without a usable camera, such as `images/1.png`";
+    let check = |capture: Capture, why: &str| {
+        let expected =
+            format!("left out 1 of 3 frames without a usable camera, such as `images/1.png`: `frames[1].{why}");
+        assert_eq!((capture.views.len(), capture.assumptions.len()), (2, 1));
+        assert!(capture.assumptions[0].starts_with(&expected), "{:?}", capture.assumptions);
+    };
     for value in [json!(null), json!([]), json!(([[0; 4]; 4])), json!(([[(); 4]; 4])), json!(([0; 16]))] {
         let set = |d: &mut Value| d["frames"][1]["transform_matrix"] = value;
-        let capture = good(set);
-        assert_eq!((capture.views.len(), &capture.assumptions[..]), (2, &[expected.to_owned()][..]));
+        check(good(set), "transform_matrix`: ");
     }
-    assert_eq!(good(|d| remove(&mut d["frames"][1], "transform_matrix")).assumptions, [expected]);
-    assert_eq!(good(|d| d["frames"][1]["fl_x"] = json!("NaN")).assumptions, [expected]);
+    check(good(|d| remove(&mut d["frames"][1], "transform_matrix")), "transform_matrix`: is missing");
+    for (field, value, why) in [
+        ("fl_x", json!("NaN"), "fl_x`: must be a finite number"),
+        ("fl_x", json!(0), "fl_x`: must be above 0, is 0"),
+        ("fl_y", json!(-800.5), "fl_y`: must be above 0, is -800.5"),
+        ("cx", json!("Infinity"), "cx`: must be a finite number"),
+    ] {
+        check(good(|d| d["frames"][1][field] = value), why);
+    }
     // Most frames must have one, and other values are mistakes.
     let most = |field: &'static str, value: Value| {
         move |d: &mut Value| (1..3).for_each(|i| d["frames"][i][field] = value.clone())
     };
     fails(most("transform_matrix", json!(null)), &["`frames[1].transform_matrix`: is missing"]);
     fails(most("fl_x", json!("NaN")), &["`frames[1].fl_x`: must be a finite number"]);
+    fails(most("fl_x", json!(0)), &["`frames[1].fl_x`: must be above 0, is 0"]);
     fails(|d| d["frames"][1]["fl_x"] = json!("wide"), &["`frames[1].fl_x`: must be a finite number"]);
 }
 
