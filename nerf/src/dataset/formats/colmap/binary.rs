@@ -44,6 +44,20 @@ impl<'a> Cursor<'a> {
         }
     }
 
+    /// Checks that nothing follows the entries. Of entries in another layout, the last would end elsewhere.
+    fn end(&self, list: &str, count: usize) -> Result<()> {
+        match self.rest.len() {
+            0 => Ok(()),
+            bytes => {
+                let what = format!(
+                    "{bytes} bytes follow the {count} entries: copy the file again, or convert it with COLMAP's \
+                     `model_converter`"
+                );
+                Err(Error::field(self.file, list, what))
+            }
+        }
+    }
+
     fn ended(&self, place: Place, member: &str) -> Error {
         place.error(self.file, member, "the file ends here: copy it again")
     }
@@ -120,6 +134,7 @@ pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
         };
         cameras.push(CameraEntry { place, id, camera });
     }
+    cursor.end("cameras", count)?;
     Ok(cameras)
 }
 
@@ -136,6 +151,7 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
         cursor.skip_list(place, "points2D", OBSERVATION)?;
         images.push(ImageEntry::new(file, place, id, q, t, camera, &name)?);
     }
+    cursor.end("images", count)?;
     Ok(images)
 }
 

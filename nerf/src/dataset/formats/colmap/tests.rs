@@ -352,10 +352,16 @@ fn binary_errors_name_the_entry() {
     let third = 85 + 8 + 48;
     fails(Binary, 1, &with(&images, third, &[3]), "`images[1].image_id`", "is `3`, as that of images[0] is");
     fails(Binary, 1, &0_u64.to_le_bytes(), "`images`", "is empty");
-    // Bytes after the end are ignored.
+    // A count that is too small, or a model with fewer parameters. Bytes after the points are ignored.
     let mut longer = binary();
     longer.iter_mut().for_each(|bytes| bytes.extend([1, 2, 3]));
-    is_the_fixture(&read(folder(Binary, "sparse", &longer).path()).unwrap());
+    for (which, list) in [(0, "cameras"), (1, "images")] {
+        let what = "3 bytes follow the 2 entries: copy the file again, or convert it with COLMAP's `model_converter`";
+        fails(Binary, which, &longer[which], &format!("`{list}`"), what);
+    }
+    let [cameras, images, _] = binary();
+    let [.., points] = longer;
+    is_the_fixture(&read(folder(Binary, "sparse", &[cameras, images, points]).path()).unwrap());
 }
 
 #[test]
