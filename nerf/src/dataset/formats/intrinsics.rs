@@ -53,6 +53,10 @@ const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e9;
 const CENTRE: f64 = 1e9;
 const SIDE: f64 = 1048576.0;
 
+/// A principal point is that of the image on its side if it is nearer to that image's middle than this share of its
+/// distance from the own middle.
+const TURNED: f64 = 0.1;
+
 /// The relative difference of two focal lengths that is no rounding of a field of view.
 const DIFFERS: f64 = 0.01;
 
@@ -158,6 +162,15 @@ impl Layers<'_, '_> {
             }
         }
         let centre = [0, 1].map(|i| given[i].unwrap_or(middle[i]));
+        let from = |[x, y]: [f64; 2]| (centre[0] - x).hypot(centre[1] - y);
+        if given != [None; 2] && from([middle[1], middle[0]]) < TURNED * from(middle) {
+            let what = format!(
+                "and `cy` are {} and {}, the middle of {height}x{width} pixels, but the image of {} has \
+                 {width}x{height}: it was turned, so give its own principal point",
+                centre[0], centre[1], self.frame.path
+            );
+            return Err(self.error("cx", what));
+        }
         let focal = self.focal([width, height], angle_y)?;
         Ok(Camera { width, height, focal, centre, lens, pose })
     }

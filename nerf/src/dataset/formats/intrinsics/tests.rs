@@ -538,3 +538,23 @@ fn principal_points_far_outside_of_the_image_are_named() {
     fails(|d| d["cx"] = json!(527), &["`cx`: is 527, far outside of an image 64 wide or high: scale it"]);
     fails(|d| d["frames"][1]["cy"] = json!(-50), &["`frames[1].cy`: is -50, far outside of an image 48"]);
 }
+
+#[test]
+fn principal_points_of_the_turned_image_are_named() {
+    let what = ["`cx`: and `cy` are 24 and 33, the middle of 48x64 pixels", "image of frames[0] has 64x48", "its own"];
+    fails(|d| set(d, &json!({ "cx": 24, "cy": 33 })), &what);
+    fails(
+        |d| set(&mut d["frames"][1], &json!({ "cx": 24, "cy": 33 })),
+        &["`frames[1].cx`: ", "image of frames[1] has"],
+    );
+    // A crop may have its principal point there nearly, and a square has one middle.
+    assert_eq!(with(json!({ "cx": 26, "cy": 32 })).centre, [26.0, 32.0]);
+    assert_eq!(with(json!({ "w": 48, "h": 48, "cx": 24, "cy": 24 })).centre, [24.0, 24.0]);
+    // One principal point for images of both orientations, which gives no size.
+    let folder = tempfile::tempdir().unwrap();
+    let document = json!({ "fl_x": 9, "cx": 4, "cy": 3, "frames": frames(&["0.png", "1.png"]) });
+    std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+    picture(&folder.path().join("0.png"), 8, 6);
+    picture(&folder.path().join("1.png"), 6, 8);
+    says(&transforms::read(folder.path()).unwrap_err().to_string(), &["`cx`: ", "image of frames[1] has 6x8"]);
+}
