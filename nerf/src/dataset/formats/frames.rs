@@ -4,10 +4,11 @@ use super::intrinsics::{check_known, check_lengths};
 use super::json::{Object, first_of, unused};
 use super::layers::Layers;
 use super::locate::{Located, locate};
+use super::paths::extension;
 use super::points::reason;
 use super::{masks, matrix, paths};
 use crate::dataset::capture::View;
-use crate::dataset::photo::Photo;
+use crate::dataset::photo::{Header, Photo};
 use crate::error::{Error, Result};
 use serde_json::Value;
 use std::cmp::Ordering;
@@ -147,6 +148,7 @@ impl Frames {
                 ..View::new(name, &frame.path, camera)
             });
         }
+        self.assumptions.extend(short_depths(&views, folder));
         check_distinct(top, &views)?;
         check_same_camera(top, shared.into_iter().map(|i| &views[i]))?;
         self.assumptions.extend(contradicting.into_iter().chain(first_of(&rounded)).chain(first_of(&blunt)));
@@ -286,6 +288,21 @@ fn needed(frame: &Object<'_>, member: &str, file: &Option<Named>, needed: bool) 
         }
         file => Ok(file.as_ref().and_then(|(_, file)| Some(file.as_ref()?.path.clone()))),
     }
+}
+
+/// A note on depth images of 8 bits in the default unit: they hold no depth beyond a quarter of a unit. Images of one
+/// capture have one format, so it reads a single header.
+fn short_depths(views: &[View], folder: &Path) -> Option<String> {
+    let is_image = |(path, unit): &&(PathBuf, f64)| *unit == DEPTH_UNIT && extension(&path.to_string_lossy()).is_some();
+    let (path, unit) = views.iter().filter_map(|view| view.depth.as_ref()).find(is_image)?;
+    if !Header::read(path).is_ok_and(|header| header.pixel == header.channels) {
+        return None;
+    }
+    let (path, most) = (path.strip_prefix(folder).unwrap_or(path).display(), 255.0 * unit);
+    Some(format!(
+        "depth images have 8 bits, such as `{path}`: in units of {unit}, no depth exceeds {most}; give the right unit \
+         as `depth_unit_scale_factor`"
+    ))
 }
 
 /// The depth files of a document: nerfstudio's `depth_file_path`, or instant-ngp's `depth_path`, which needs an

@@ -308,6 +308,25 @@ fn masks_depths_and_sharpness_are_read() {
 }
 
 #[test]
+fn depth_images_of_8_bits_need_a_unit() {
+    let folder = folder(|d| d["frames"][0]["depth_file_path"] = json!("depth/0.png"));
+    let path = folder.path().join("depth/0.png");
+    picture(&path, 8, 6);
+    let expected = "depth images have 8 bits, such as `depth/0.png`: in units of 0.001, no depth exceeds 0.255; give \
+                    the right unit as `depth_unit_scale_factor`";
+    assert_eq!(read(folder.path()).unwrap().assumptions, [expected]);
+    let file = folder.path().join(FILE);
+    let plain = std::fs::read_to_string(&file).unwrap();
+    let mut document: Value = serde_json::from_str(&plain).unwrap();
+    document["depth_unit_scale_factor"] = json!(0.02);
+    std::fs::write(&file, document.to_string()).unwrap();
+    assert!(read(folder.path()).unwrap().assumptions.is_empty());
+    std::fs::write(file, plain).unwrap();
+    image::ImageBuffer::<image::Luma<u16>, _>::new(8, 6).save(path).unwrap();
+    assert!(read(folder.path()).unwrap().assumptions.is_empty());
+}
+
+#[test]
 fn lists_of_names_are_splits() {
     let splits = |change: fn(&mut Value)| good(change).views.iter().map(|view| view.split).collect::<Vec<_>>();
     assert_eq!(splits(|_| {}), [None; 3]);
@@ -529,7 +548,8 @@ fn images_masks_and_depths_of_another_machine_are_found() {
     }
     assert_eq!(capture.views[2].image, None);
     let expected = "`C:/captures/scene/images/0.jpg` does not exist: used `images/0.png`, and 1 file likewise";
-    assert_eq!((capture.assumptions.len(), capture.assumptions[0].as_str()), (3, expected));
+    // Images, masks, depths and the bits of the depths.
+    assert_eq!((capture.assumptions.len(), capture.assumptions[0].as_str()), (4, expected));
     // Two images that fit.
     picture(&at("images/0.webp"), 8, 6);
     says(&failure(read(folder.path()), FILE), &["`frames[0].file_path`", "`images/0.png` and `images/0.webp` fit"]);
