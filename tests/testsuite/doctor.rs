@@ -1,6 +1,6 @@
 //! The doctor names faults planted in a good capture, and finds none in the capture itself.
 
-use raygrad::nerf::dataset::{Capture, Format, Point, SceneAnalysis, SceneType, Split, View, evenly_spaced};
+use raygrad::nerf::dataset::{Capture, Format, Photo, Point, SceneAnalysis, SceneType, Split, View, evenly_spaced};
 use raygrad::nerf::doctor::{
     DoctorOptions, Finding, FindingKind as Kind, Report, Resolution, Severity, examine, examine_cameras,
 };
@@ -348,6 +348,48 @@ fn doctor_finds_useless_masks_and_alpha() {
     );
     (0..48).for_each(|view| planted.redraw(view, opaque));
     found(&planted.report_of(ALL), Kind::OpaqueAlpha, Note, &(0..48).collect::<Vec<_>>(), &[]);
+}
+
+#[test]
+fn doctor_finds_hollow_alpha_and_identical_images() {
+    let planted = Planted::new();
+    let inverted = |image: &Image| {
+        let data = image.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2], 1.0 - p[3]]).collect();
+        Image { data, ..image.clone() }
+    };
+    planted.redraw(3, inverted);
+    assert!(planted.report().finds(Kind::HollowAlpha).is_none(), "a single image");
+    (0..ALL).for_each(|view| planted.redraw(view, inverted));
+    let report = planted.report();
+    let hollow = report.finds(Kind::HollowAlpha).unwrap();
+    assert!(hollow.severity == Warning && hollow.views.len() > ALL / 2, "{hollow:#?}");
+    let grey = Image { width: SIZE, height: SIZE, channels: 3, data: vec![0.5; 3 * SIZE * SIZE] };
+    for image in [&grey, &PHOTOGRAPHS[0].2] {
+        (0..ALL).for_each(|view| planted.redraw(view, |_| image.clone()));
+        let report = planted.report();
+        let finding = report.finds(Kind::IdenticalImages).unwrap();
+        assert_eq!(
+            (finding.severity, finding.views.len(), &finding.what[..]),
+            (Error, ALL, "all 48 images have the same pixels")
+        );
+        assert!(report.finds(Kind::DuplicateImages).is_none() && report.finds(Kind::Leak).is_none());
+    }
+}
+
+#[test]
+fn doctor_notes_jpeg_files_without_their_end() {
+    let mut planted = Planted::new();
+    let path = planted.folder.path().join("cut.jpg");
+    Photo::from(PHOTOGRAPHS[3].2.over([1.0; 3])).save(&path).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, &bytes[..bytes.len() - 2]).unwrap();
+    planted.capture.views[3].image = Some(path.clone());
+    let report = planted.report();
+    let finding = report.finds(Kind::MissingEnd).unwrap();
+    assert_eq!((finding.severity, &finding.views[..]), (Note, &["03.png".to_owned()][..]));
+    std::fs::write(path, &bytes[..bytes.len() - 99]).unwrap();
+    let report = planted.report();
+    assert!(report.finds(Kind::ImagesUndecodable).is_some() && report.finds(Kind::MissingEnd).is_none());
 }
 
 #[test]

@@ -204,13 +204,23 @@ impl Photo {
     pub(super) fn white_border(&self) -> f64 {
         /// The least value of a white channel.
         const WHITE: f32 = 0.97;
+        self.border(|pixel| pixel[..3].iter().all(|value| *value >= WHITE))
+    }
+
+    /// The share of the one-pixel border that is opaque: 0 to 1.
+    pub(crate) fn opaque_border(&self) -> f64 {
+        self.border(|pixel| pixel[3] == 1.0)
+    }
+
+    /// The share of the pixels of the border that pass a test: 0 to 1.
+    fn border(&self, passes: impl Fn([f32; 4]) -> bool) -> f64 {
         let Photo { width, height, .. } = *self;
         let across = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
         let down = (1..height.saturating_sub(1)).flat_map(|y| [(0, y), (width - 1, y)]);
-        let (count, white) = across.chain(down).fold((0, 0), |(count, white), (x, y)| {
-            (count + 1, white + usize::from(self.pixel(x, y)[..3].iter().all(|value| *value >= WHITE)))
-        });
-        white as f64 / f64::from(count.max(1))
+        let (count, passed) = across
+            .chain(down)
+            .fold((0, 0), |(count, passed), (x, y)| (count + 1, passed + u32::from(passes(self.pixel(x, y)))));
+        f64::from(passed) / f64::from(count.max(1))
     }
 
     /// Returns a pixel as RGBA, 0 to 1; alpha is 1 without an alpha channel.

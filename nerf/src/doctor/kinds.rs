@@ -143,6 +143,10 @@ kinds! {
     DuplicateImages = "duplicate-images", Warning,
         "the pixels of {} are exactly those of another image",
         "Remove one of each pair. If their poses differ, one is wrong; if not, the image counts twice.";
+    /// All images are equal.
+    IdenticalImages = "identical-images", Error,
+        "all {} have the same pixels",
+        "Training needs different views. Check how the images were copied, rendered or extracted from a video.";
     /// Images are blurred.
     Blurred = "blurred", Warning,
         "the sharpness of {} is far below that of neighbouring images",
@@ -202,11 +206,20 @@ kinds! {
     OpaqueAlpha = "opaque-alpha", Note,
         "the alpha channel of {} is opaque everywhere",
         "Alpha then says nothing about the background. For an object on an empty background, save it with alpha 0.";
+    /// Images are transparent within an opaque border.
+    HollowAlpha = "hollow-alpha", Warning,
+        "the alpha channel of {} is transparent in the middle and opaque along the border",
+        "Alpha is 0 where the background is empty. If it is 0 on the object, invert it. To hide something that moved, \
+         use masks.";
     /// Colour profiles cannot be read.
     ColorProfile = "color-profile", Note,
         "cannot read the colour profile of {}; colours count as sRGB",
         "Nothing to do if the colours look right. Otherwise convert the images to sRGB. raygrad reads RGB profiles \
          with a matrix and curves.";
+    /// JPEG files lack their end marker.
+    MissingEnd = "missing-end", Note,
+        "the end marker of {} is missing, but no pixel",
+        "Nothing to do in raygrad. Other programs may refuse these JPEG files: save them again.";
     /// Single images do not match their cameras.
     WrongPose = "wrong-pose", Warning,
         "cannot match {} with neighbouring images at the places that the poses predict",

@@ -14,6 +14,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 const LONGEST: usize = 800;
 /// The longest side of the images that are compared with each other.
 const SMALL: usize = 200;
+/// The least transparent share of a hollow image, and the least opaque share of its border.
+const HOLLOW: f64 = 0.05;
+const OPAQUE_BORDER: f64 = 0.98;
 /// The least luminance; darker pixels count as this.
 const DARK: f64 = 0.01;
 
@@ -21,8 +24,12 @@ const DARK: f64 = 0.01;
 pub(super) struct Look {
     /// True if a pixel is transparent; `None` without an alpha channel.
     pub transparent: Option<bool>,
+    /// True if the border is opaque and pixels within it are transparent.
+    pub hollow: bool,
     /// True if the colour profile cannot be read.
     pub unread_profile: bool,
+    /// True if the file is a JPEG without its end marker.
+    pub lacks_end: bool,
     /// Equal for equal images.
     pub hash: u64,
     /// The logarithm of the variance of the Laplacian over the variance of the brightness; `None` of a flat image.
@@ -59,7 +66,9 @@ fn look_at(view: &View) -> Result<Look> {
     let size = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera));
     let photo = Photo::open(&path, size)?;
     let unread_profile = Photo::has_unread_profile(&path)?;
+    let lacks_end = Photo::file_lacks_end(&path)?;
     let transparent = photo.has_alpha().then(|| photo.transparent_share() > 0.0);
+    let hollow = photo.transparent_share() > HOLLOW && photo.opaque_border() > OPAQUE_BORDER;
     let [middle, small] = [LONGEST, SMALL].map(|longest| photo.at_most(longest));
     let mask = view.mask_photo(None)?;
     let used = mask
@@ -72,7 +81,7 @@ fn look_at(view: &View) -> Result<Look> {
     let picture = size.and_then(|_| Picture::new(&view.camera, &small, mask.as_ref()));
     let sharpness = sharpness(&grey(&middle, mean(&small.to_image())));
     let hash = hasher.finish();
-    Ok(Look { transparent, unread_profile, hash, sharpness, luminance, balance, used, picture })
+    Ok(Look { transparent, hollow, unread_profile, lacks_end, hash, sharpness, luminance, balance, used, picture })
 }
 
 /// See [`Look::sharpness`].

@@ -94,9 +94,14 @@ pub(super) fn examine(seen: &[Seen<'_>], findings: &mut Findings) {
     alpha(seen, findings);
     let unread = seen.iter().filter(|one| one.look.unread_profile);
     findings.about(Kind::ColorProfile, unread.map(|one| one.view), &[]);
+    findings.about(Kind::MissingEnd, seen.iter().filter(|one| one.look.lacks_end).map(|one| one.view), &[]);
 }
 
 fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
+    if seen.len() > 1 && seen.iter().all(|one| one.look.hash == seen[0].look.hash) {
+        findings.about(Kind::IdenticalImages, seen.iter().map(|one| one.view), &[]);
+        return;
+    }
     let mut first: HashMap<u64, &View> = HashMap::new();
     let (mut same, mut leaks) = (vec![], vec![]);
     for Seen { view, look } in seen {
@@ -176,6 +181,11 @@ fn masks(seen: &[Seen<'_>], findings: &mut Findings) {
 
 fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
     let with = |transparent| seen.iter().filter(move |one| one.look.transparent == Some(transparent));
+    let hollow: Vec<&View> = seen.iter().filter(|one| one.look.hollow).map(|one| one.view).collect();
+    // A ring or a window may surround single images.
+    if 2 * hollow.len() > seen.len() {
+        findings.about(Kind::HollowAlpha, hollow, &[]);
+    }
     let opaque = findings.about(Kind::OpaqueAlpha, with(false).map(|one| one.view), &[]);
     if let Some(finding) = opaque
         && with(true).next().is_some()
@@ -284,7 +294,9 @@ mod tests {
             let looks: Vec<Look> = (0..count)
                 .map(|i| Look {
                     transparent: None,
+                    hollow: false,
                     unread_profile: false,
+                    lacks_end: false,
                     hash: 0,
                     sharpness: (i % 5 != 2).then(&mut number),
                     luminance: None,
