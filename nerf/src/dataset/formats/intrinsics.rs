@@ -56,6 +56,8 @@ const SIDE: f64 = 1048576.0;
 /// A principal point is that of the image on its side if it is nearer to that image's middle than this share of its
 /// distance from the own middle.
 const TURNED: f64 = 0.1;
+/// The least ratio of the sides of an image that has a turned shape.
+const OBLONG: f64 = 1.1;
 
 /// The relative difference of two focal lengths that is no rounding of a field of view.
 const DIFFERS: f64 = 0.01;
@@ -163,7 +165,8 @@ impl Layers<'_, '_> {
         }
         let centre = [0, 1].map(|i| given[i].unwrap_or(middle[i]));
         let from = |[x, y]: [f64; 2]| (centre[0] - x).hypot(centre[1] - y);
-        if given != [None; 2] && from([middle[1], middle[0]]) < TURNED * from(middle) {
+        let is_oblong = middle[0].max(middle[1]) > OBLONG * middle[0].min(middle[1]);
+        if is_oblong && given != [None; 2] && from([middle[1], middle[0]]) < TURNED * from(middle) {
             let what = format!(
                 "and `cy` are {} and {}, the middle of {height}x{width} pixels, but the image of {} has \
                  {width}x{height}: it was turned, so give its own principal point",

@@ -50,7 +50,7 @@ impl<'a> Cursor<'a> {
             0 => Ok(()),
             bytes => {
                 let what = format!(
-                    "{bytes} bytes follow the {count} entries: copy the file again, or convert it with COLMAP's \
+                    "{bytes} bytes follow the last of {count} entries: copy the file again, or convert it with COLMAP's \
                      `model_converter`"
                 );
                 Err(Error::field(self.file, list, what))

@@ -547,9 +547,10 @@ fn principal_points_of_the_turned_image_are_named() {
         |d| set(&mut d["frames"][1], &json!({ "cx": 24, "cy": 33 })),
         &["`frames[1].cx`: ", "image of frames[1] has"],
     );
-    // A crop may have its principal point there nearly, and a square has one middle.
+    // A crop may have its principal point there nearly, and middles of a square are close to each other.
     assert_eq!(with(json!({ "cx": 26, "cy": 32 })).centre, [26.0, 32.0]);
     assert_eq!(with(json!({ "w": 48, "h": 48, "cx": 24, "cy": 24 })).centre, [24.0, 24.0]);
+    assert_eq!(with(json!({ "w": 50, "h": 48, "cx": 24, "cy": 25 })).centre, [24.0, 25.0]);
     // One principal point for images of both orientations, which gives no size.
     let folder = tempfile::tempdir().unwrap();
     let document = json!({ "fl_x": 9, "cx": 4, "cy": 3, "frames": frames(&["0.png", "1.png"]) });
