@@ -221,9 +221,11 @@ impl<T: Scalar> Slot<T> {
             parallel::each_of(sums.rows().chunks(ROWS).zip(sums.sums().chunks(ROWS * features)), |_, (rows, sums)| {
                 let moved = simd::dispatch(
                     #[inline(always)]
-                    // SAFETY: `RowSums` has each row once and below the number of its rows, which was checked after the
-                    // last call of other code. The rows of one part end where those of the next begin: so no other task
-                    // and no other turn of its loop has them. `tasks_share_a_table` and `parts_share_a_table` run it.
+                    // SAFETY: `RowSums` lists a row once, and only rows below its `table_rows`. The assertion above compares
+                    // these, and the features, after the last call of a user's code. The sizes add up to the rows of the
+                    // table, and without overflow, since sums for all of them were allocated. So the rows from `first` on
+                    // are in the table, and no other task or turn of its loop has them. `tasks_share_a_table` and
+                    // `parts_share_a_table` run it.
                     || unsafe { table.move_rows(first, rows, sums, &rule) },
                 );
                 for (count, more) in counts.iter().zip(moved) {

@@ -109,8 +109,9 @@ impl<T: Scalar> Table<'_, T> {
     /// their next step. Returns the numbers of updated and skipped elements.
     ///
     /// # Safety
-    /// `rows` has no row twice, and no other code accesses these rows meanwhile.
+    /// Counted from `first` on, `rows` are rows of the table. No other code accesses them meanwhile.
     #[inline(always)]
+    // SAFETY: kept by `Memory`, the only caller, which gives each row to one task.
     pub unsafe fn move_rows<const M: usize, R: Rule<T, M>>(
         &self,
         first: usize,
@@ -119,7 +120,7 @@ impl<T: Scalar> Table<'_, T> {
         rule: &impl Fn(u32) -> R,
     ) -> [usize; 2] {
         // The usual widths as constants: the loops over a row then unroll into one vector.
-        // SAFETY: as the caller's.
+        // SAFETY: the caller's promise is the same.
         unsafe {
             match self.features {
                 1 => self.move_rows_by::<M, 1, R>(first, rows, grads, rule),
@@ -135,6 +136,7 @@ impl<T: Scalar> Table<'_, T> {
     /// # Safety
     /// As for [`move_rows`](Self::move_rows).
     #[inline(always)]
+    // SAFETY: kept by `move_rows`, the only caller.
     unsafe fn move_rows_by<const M: usize, const W: usize, R: Rule<T, M>>(
         &self,
         first: usize,
@@ -159,7 +161,8 @@ impl<T: Scalar> Table<'_, T> {
                 continue;
             }
             let row = first + row as usize;
-            // SAFETY: the caller vouches that the row is this call's alone.
+            // SAFETY: the row is in the table, so the products do not overflow, and the elements of another row are
+            // others. The caller promises that no other code has this row; the borrows of the last turn have ended.
             let (x, memory, step) = unsafe {
                 let x = self.values.get(row * features, features);
                 (x, self.memory.get(M * row * features, M * features), self.steps.get(row, 1))
@@ -188,7 +191,7 @@ pub(super) struct Shared<'a, T> {
     _borrow: PhantomData<&'a mut [T]>,
 }
 
-// SAFETY: it stands for an exclusive borrow of a slice whose parts may go to other threads; `get` leaves it to its callers
+// SAFETY: it stands for an exclusive borrow of a slice, whose parts may go to other threads. The callers of `get` ensure
 // that no element is borrowed twice. `tasks_share_a_table` has several tasks write.
 unsafe impl<T: Send> Sync for Shared<'_, T> {}
 
@@ -206,7 +209,7 @@ impl<'a, T> Shared<'a, T> {
     /// If there are fewer.
     #[inline(always)]
     #[allow(clippy::mut_from_ref)] // that is its point
-    // SAFETY: kept by the callers, whose elements are all different.
+    // SAFETY: kept by `Table::move_rows_by`, the only caller.
     unsafe fn get(&self, start: usize, len: usize) -> &mut [T] {
         assert!(start <= self.len && len <= self.len - start, "elements beyond the table");
         // SAFETY: the range lies within the slice that `new` borrowed, and the caller ensures that no other borrow exists.
