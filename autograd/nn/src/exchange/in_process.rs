@@ -1,6 +1,6 @@
 //! Ranks as threads of one process.
 
-use super::{Exchange, ExchangeError, FirstError, TIMEOUT, after, check_parts};
+use super::{Exchange, ExchangeError, FirstError, TIMEOUT, next_round};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
@@ -59,10 +59,7 @@ impl Exchange for InProcess {
     }
 
     fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
-        check_parts(parts, self.ranks());
-        let result = after(&self.failed.clone(), || self.round(parts));
-        self.failed = result.as_ref().err().cloned();
-        result
+        next_round(self, parts, Self::round, |own| &mut own.failed)
     }
 
     fn set_timeout(&mut self, timeout: Duration) {

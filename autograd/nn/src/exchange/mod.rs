@@ -110,13 +110,19 @@ const TIMEOUT: Duration = Duration::from_secs(600);
 /// The first error of an exchange: after it, messages of different rounds could meet.
 type FirstError = Option<ExchangeError>;
 
-/// The result of a round, unless one before it has failed.
-fn after<R>(first: &FirstError, round: impl FnOnce() -> Result<R, ExchangeError>) -> Result<R, ExchangeError> {
-    first.clone().map_or_else(round, Err)
-}
+/// What all ranks have sent to this one, by rank.
+type Received = Result<Vec<Vec<u8>>, ExchangeError>;
 
-/// Asserts that there is one part for each rank.
+/// Makes one round of an exchange, unless one before it has failed.
 #[track_caller]
-fn check_parts(parts: &[&[u8]], ranks: usize) {
-    assert_eq!(parts.len(), ranks, "one part for each rank");
+fn next_round<E: Exchange>(
+    exchange: &mut E,
+    parts: &[&[u8]],
+    round: fn(&mut E, &[&[u8]]) -> Received,
+    failed: fn(&mut E) -> &mut FirstError,
+) -> Received {
+    assert_eq!(parts.len(), exchange.ranks(), "one part for each rank");
+    let result = failed(exchange).clone().map_or_else(|| round(exchange, parts), Err);
+    *failed(exchange) = result.as_ref().err().cloned();
+    result
 }

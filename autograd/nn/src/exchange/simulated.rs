@@ -1,6 +1,6 @@
 //! Ranks in one process, with the times of a network.
 
-use super::{Exchange, ExchangeError, FirstError, InProcess, TIMEOUT, after, check_parts};
+use super::{Exchange, ExchangeError, FirstError, InProcess, TIMEOUT, next_round};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use std::time::Duration;
@@ -112,10 +112,7 @@ impl Exchange for Simulated {
     }
 
     fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
-        check_parts(parts, self.ranks());
-        let result = after(&self.failed.clone(), || self.round(parts));
-        self.failed = result.as_ref().err().cloned();
-        result
+        next_round(self, parts, Self::round, |own| &mut own.failed)
     }
 
     /// Sets how long a rank waits for another one, by the simulated clock.

@@ -1,6 +1,6 @@
 //! Ranks on several machines, connected by TCP.
 
-use super::{Exchange, ExchangeError, FirstError, after, check_parts};
+use super::{Exchange, ExchangeError, FirstError, next_round};
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{TcpListener, TcpStream, ToSocketAddrs};
 use std::sync::mpsc::{Sender, channel};
@@ -175,10 +175,7 @@ impl Exchange for Tcp {
     }
 
     fn all_to_all(&mut self, parts: &[&[u8]]) -> Result<Vec<Vec<u8>>, ExchangeError> {
-        check_parts(parts, self.ranks());
-        let result = after(&self.failed.clone(), || self.round(parts));
-        self.failed = result.as_ref().err().cloned();
-        result
+        next_round(self, parts, Self::round, |own| &mut own.failed)
     }
 
     fn set_timeout(&mut self, timeout: Duration) {
