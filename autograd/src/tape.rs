@@ -385,20 +385,9 @@ impl<T: Scalar> Tape<T> {
         value: Tensor<T>,
         at: &'static Location<'static>,
     ) -> Var<'t, T> {
-        if self.recording.get() && inputs.iter().any(|x| x.node.is_some()) {
-            self.append(op, inputs, value, at)
-        } else {
-            self.constant(value)
+        if !self.recording.get() || inputs.iter().all(|x| x.node.is_none()) {
+            return self.constant(value);
         }
-    }
-
-    fn append<'t>(
-        &'t self,
-        op: Box<dyn Op<T>>,
-        inputs: &[&Var<'t, T>],
-        value: Tensor<T>,
-        at: &'static Location<'static>,
-    ) -> Var<'t, T> {
         // Where a gradient is differentiated, the reference of a fused operation takes all inputs.
         let reads = if op.is_fused() { op.reads() } else { op.reads_for(&|i| inputs[i].node.is_some()) };
         let edges = inputs.iter().map(|x| x.node.unwrap_or(CONSTANT));
