@@ -29,5 +29,26 @@ mod plain;
 pub mod survey;
 pub(crate) mod wide;
 
+use crate::Real;
+
+/// `x` limited to `lo..=hi`, but NaN stays NaN (`f32::max` would drop it). Two instructions.
+#[inline(always)]
+fn clamp<T: PartialOrd>(x: T, lo: T, hi: T) -> T {
+    let x = if x < lo { lo } else { x };
+    if x > hi { hi } else { x }
+}
+
+/// The polynomial `c[0] + c[1] x + c[2] x^2 + ...`. Horner's rule runs for even and odd powers side by side, since a
+/// single chain has a longer latency.
+#[inline(always)]
+fn polynomial<T: Real, const N: usize>(x: T, c: [T; N]) -> T {
+    let x2 = x * x;
+    let (mut last, mut other) = (c[N - 1], c[N - 2]);
+    for i in (0..N - 2).rev() {
+        (last, other) = (other, last.mul_add(x2, c[i]));
+    }
+    last.mul_add(x, other)
+}
+
 #[cfg(test)]
 mod tests;

@@ -18,7 +18,8 @@ macro_rules! functions_of {
     ($t:ident) => {
         /// The functions in this precision.
         pub mod $t {
-            use crate::vmath::$t::polynomial;
+            use crate::vmath::$t::exp_minus;
+            use crate::vmath::polynomial;
             use crate::vmath::wide::$t::Wide;
             use crate::Wide as _;
 
@@ -77,6 +78,18 @@ macro_rules! functions_of {
             fn exponentials(a: $t) -> ($t, $t) {
                 let e = Wide::exp(a, 0.0);
                 ((e * Wide::new(0.5)).narrow(), 0.5 / e.narrow())
+            }
+
+            /// The logistic function `1 / (1 + e^-x)`, within 2 ULP.
+            ///
+            /// With `e = e^-|x|` it is `1 / (1 + e)` for x >= 0 and `e / (1 + e)` below. So it does not overflow, and small
+            /// results keep all their digits. Below 1/4, one step of `y = e (1 - y)` corrects the rounding of `1 + e` and of
+            /// the quotient.
+            #[inline(always)]
+            pub fn sigmoid(x: $t) -> $t {
+                let e = exp_minus($t::abs(x));
+                let y = if x < 0.0 { e } else { 1.0 } / (1.0 + e);
+                if y < 0.25 { (-e).mul_add(y, e) } else { y }
             }
 
             /// The distribution function of the standard normal distribution, within 5 ULP.

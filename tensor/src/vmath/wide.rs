@@ -11,7 +11,8 @@ macro_rules! wide {
         /// Products in this precision.
         pub mod $t {
             use super::power;
-            use crate::vmath::$t::{ROUND, clamp, erf_near, expm1_of_rest, polynomial, round_product};
+            use crate::vmath::$t::{ROUND, erf_near, expm1_of_rest, round_product};
+            use crate::vmath::{clamp, polynomial};
             use std::ops::{Div, Mul};
             use std::$t::consts::{FRAC_1_SQRT_2, LOG2_E};
 

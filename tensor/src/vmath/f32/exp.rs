@@ -1,13 +1,14 @@
-//! Exponentials, and the functions computed from them: tanh and the logistic function.
+//! Exponentials, and tanh.
 //!
 //! All share one reduction, `x = n ln 2 + r` with integer n and |r| <= ln 2 / 2, and one polynomial for `e^r - 1`.
 
-use super::{ROUND, clamp, polynomial, power_of_two, round_product};
+use super::{ROUND, power_of_two, round_product};
+use crate::vmath::{clamp, polynomial};
 use std::f32::consts::{LN_2, LOG2_E};
 
 /// ln 2 in two parts. The first has 15 significant bits: times an integer below 2^8 it is exact.
-const LN_2_HIGH: f32 = 0.693_145_75;
-const LN_2_LOW: f32 = 1.428_606_8e-6;
+pub(super) const LN_2_HIGH: f32 = 0.693_145_75;
+pub(super) const LN_2_LOW: f32 = 1.428_606_8e-6;
 
 /// `e^r - 1 = r + r^2 q(r)` for |r| <= ln 2 / 2, relative error 2^-31.
 const EXPM1: [f32; 6] = [0.5, 0.166_666_66, 0.041_666_48, 0.008_333_564, 0.001_393_334_9, 0.000_197_458_07];
@@ -52,7 +53,7 @@ pub fn exp(x: f32) -> f32 {
 /// `e^-x` for x >= 0, the same bits as `exp(-x)` in fewer steps. 2^n cannot overflow, so n + 64 is the exponent of one
 /// factor, and the other is 2^-64. The rounding to n adds the exponent's bias too.
 #[inline(always)]
-pub(super) fn exp_minus(x: f32) -> f32 {
+pub(in crate::vmath) fn exp_minus(x: f32) -> f32 {
     const BIASED: f32 = ROUND + 191.0; // 127 + 64
     let x = if -x < -104.0 { -104.0 } else { -x };
     let t = x.mul_add(LOG2_E, BIASED);
@@ -95,16 +96,4 @@ pub fn tanh(x: f32) -> f32 {
     let near = (a * a2).mul_add(polynomial(a2, P), a);
     let far = 1.0 - 2.0 / (exp(2.0 * a) + 1.0);
     if a < 0.55 { near } else { far }.copysign(x)
-}
-
-/// The logistic function `1 / (1 + e^-x)`, within 2 ULP.
-///
-/// With `e = e^-|x|` it is `1 / (1 + e)` for x >= 0 and `e / (1 + e)` below. So it does not overflow, and small results
-/// keep all their digits: `sigmoid(-89)` is the subnormal 2.23e-39. Below 1/4, one step of `y = e (1 - y)` corrects the
-/// rounding of `1 + e` and of the quotient.
-#[inline(always)]
-pub fn sigmoid(x: f32) -> f32 {
-    let e = exp_minus(x.abs());
-    let y = if x < 0.0 { e } else { 1.0 } / (1.0 + e);
-    if y < 0.25 { (-e).mul_add(y, e) } else { y }
 }

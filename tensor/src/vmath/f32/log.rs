@@ -3,12 +3,9 @@
 //! All write the argument as `2^k m` with m between sqrt(1/2) and sqrt(2), and share one polynomial for `ln(1 + f)`,
 //! `f = m - 1`.
 
-use super::{exp::exp_minus, polynomial};
+use super::exp::{LN_2_HIGH, LN_2_LOW, exp_minus};
+use crate::vmath::polynomial;
 use std::f32::consts::{FRAC_1_SQRT_2, LN_2, LOG2_E, SQRT_2};
-
-/// ln 2 in two parts. The first has 15 significant bits: times an integer below 2^8 it is exact.
-const LN_2_HIGH: f32 = 0.693_145_75;
-const LN_2_LOW: f32 = 1.428_606_8e-6;
 
 /// log2(e) - LOG2_E.
 const LOG2_E_LOW: f32 = 1.925_963e-8;

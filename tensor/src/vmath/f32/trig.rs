@@ -1,6 +1,7 @@
 //! Sine and cosine, of x and of pi x.
 
-use super::polynomial;
+use crate::vmath::f64::ROUND;
+use crate::vmath::polynomial;
 use std::f32::consts::{FRAC_2_PI, FRAC_PI_2, PI};
 
 /// Largest argument of `sin_quick` and `cos_quick`. The quotient by pi/2 has at most 16 bits there, and its rounding
@@ -22,9 +23,6 @@ const TURNS: [f64; 6] = [
     0x0ee0_6db1 as f64 * TWO_TO_MINUS_29 * TWO_TO_MINUS_29 * TWO_TO_MINUS_29 * TWO_TO_MINUS_29 * TWO_TO_MINUS_29,
     6.551007954373285e-45,
 ];
-
-/// 1.5 * 2^52: adding it rounds to an integer, which the low bits of the sum then hold.
-const ROUND: f64 = 6_755_399_441_055_744.0;
 
 /// Reduces `0 <= x <= QUICK` to `r + n pi/2` with |r| <= pi/4 and a little. Only the last two bits of n are valid.
 ///

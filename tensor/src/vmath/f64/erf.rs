@@ -1,6 +1,7 @@
 //! The error function.
 
-use super::{clamp, exp::exp_minus, polynomial};
+use super::exp_minus;
+use crate::vmath::{clamp, polynomial};
 
 /// The error function `2/sqrt(pi) * integral from 0 to x of e^-t^2 dt`, within 2 ULP; exactly +-1 beyond 5.93.
 ///

@@ -1,13 +1,14 @@
-//! Exponentials, and the functions computed from them: tanh and the logistic function.
+//! Exponentials, and tanh.
 //!
 //! All share one reduction, `x = n ln 2 + r` with integer n and |r| <= ln 2 / 2, and one polynomial for `e^r - 1`.
 
-use super::{ROUND, clamp, polynomial, power_of_two, round_product};
+use super::{ROUND, power_of_two, round_product};
+use crate::vmath::{clamp, polynomial};
 use std::f64::consts::{LN_2, LOG2_E};
 
 /// ln 2 in two parts. The first has 42 significant bits: times an integer below 2^11 it is exact.
-const LN_2_HIGH: f64 = 0.693_147_180_559_890_3;
-const LN_2_LOW: f64 = 5.497_923_018_708_371e-14;
+pub(super) const LN_2_HIGH: f64 = 0.693_147_180_559_890_3;
+pub(super) const LN_2_LOW: f64 = 5.497_923_018_708_371e-14;
 
 /// `e^r - 1 = r + r^2 q(r)` for |r| <= ln 2 / 2, relative error 2^-60.
 const EXPM1: [f64; 11] = [
@@ -24,12 +25,6 @@ const EXPM1: [f64; 11] = [
     2.091_467_937_658_393_5e-9,
 ];
 
-/// `e^(r + low) - 1` for |r| <= ln 2 / 2 and a rounding error `low` of r.
-#[inline(always)]
-fn expm1_near(r: f64, low: f64) -> f64 {
-    (r * r).mul_add(polynomial(r, EXPM1), low) + r
-}
-
 /// `e^r` for `r = x - n ln 2`.
 #[inline(always)]
 fn exp_of_rest(x: f64, n: f64) -> f64 {
@@ -42,7 +37,8 @@ fn exp_of_rest(x: f64, n: f64) -> f64 {
 pub(in crate::vmath) fn expm1_of_rest(x: f64, n: f64) -> f64 {
     let high = n.mul_add(-LN_2_HIGH, x); // exact
     let r = n.mul_add(-LN_2_LOW, high);
-    expm1_near(r, n.mul_add(-LN_2_LOW, high - r))
+    let r_low = n.mul_add(-LN_2_LOW, high - r);
+    (r * r).mul_add(polynomial(r, EXPM1), r_low) + r
 }
 
 /// 2^64, the last scaling factor of results: 2^n alone may be out of range, 2^(n - 64) or 2^(n + 64) is not.
@@ -71,7 +67,7 @@ pub fn exp(x: f64) -> f64 {
 
 /// `e^-x` for x >= 0, the same bits as `exp(-x)` in fewer steps.
 #[inline(always)]
-pub(super) fn exp_minus(x: f64) -> f64 {
+pub(in crate::vmath) fn exp_minus(x: f64) -> f64 {
     let x = if -x < -746.0 { -746.0 } else { -x };
     let t = x.mul_add(LOG2_E, bias(-1.0));
     scale(exp_of_rest(x, t - bias(-1.0)), t, -1.0)
@@ -137,15 +133,4 @@ pub fn tanh(x: f64) -> f64 {
     let near = (a * a2).mul_add(polynomial(a2, P), a);
     let far = 1.0 - 2.0 / (exp(2.0 * a) + 1.0);
     if a < 0.55 { near } else { far }.copysign(x)
-}
-
-/// The logistic function `1 / (1 + e^-x)`, within 2 ULP.
-///
-/// With `e = e^-|x|` it is `1 / (1 + e)` for x >= 0 and `e / (1 + e)` below. So it does not overflow, and small results
-/// keep all their digits. Below 1/4, one step of `y = e (1 - y)` corrects the rounding of `1 + e` and of the quotient.
-#[inline(always)]
-pub fn sigmoid(x: f64) -> f64 {
-    let e = exp_minus(x.abs());
-    let y = if x < 0.0 { e } else { 1.0 } / (1.0 + e);
-    if y < 0.25 { (-e).mul_add(y, e) } else { y }
 }

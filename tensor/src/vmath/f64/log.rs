@@ -3,12 +3,9 @@
 //! All write the argument as `2^k m` with m between sqrt(1/2) and sqrt(2), and share one rational function for
 //! `ln(1 + f)`, `f = m - 1`.
 
-use super::{exp::exp_minus, polynomial};
+use super::exp::{LN_2_HIGH, LN_2_LOW, exp_minus};
+use crate::vmath::polynomial;
 use std::f64::consts::{FRAC_1_SQRT_2, LN_2, LOG2_E, SQRT_2};
-
-/// ln 2 in two parts. The first has 42 significant bits: times an integer below 2^11 it is exact.
-const LN_2_HIGH: f64 = 0.693_147_180_559_890_3;
-const LN_2_LOW: f64 = 5.497_923_018_708_371e-14;
 
 /// log2(e) - LOG2_E.
 const LOG2_E_LOW: f64 = 2.035_527_374_093_103_3e-17;

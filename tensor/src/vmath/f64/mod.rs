@@ -9,8 +9,9 @@ mod trig;
 pub use super::plain::f64::*;
 pub use erf::erf;
 pub(in crate::vmath) use erf::erf_near;
+pub(in crate::vmath) use exp::exp_minus;
 pub(in crate::vmath) use exp::expm1_of_rest;
-pub use exp::{exp, exp2, expm1, sigmoid, tanh};
+pub use exp::{exp, exp2, expm1, tanh};
 pub use log::{ln, ln1p, log2, softplus};
 pub(crate) use trig::QUICK;
 pub use trig::{cos, cos_pi, cos_quick, sin, sin_pi, sin_quick};
@@ -30,23 +31,4 @@ pub(in crate::vmath) fn round_product(a: f64, b: f64) -> (f64, i32) {
 #[inline(always)]
 fn power_of_two(n: i32) -> f64 {
     f64::from_bits((n.wrapping_add(1023) as u64) << 52)
-}
-
-/// `x` limited to `lo..=hi`, but NaN stays NaN (`f64::max` would drop it). Two instructions.
-#[inline(always)]
-pub(in crate::vmath) fn clamp(x: f64, lo: f64, hi: f64) -> f64 {
-    let x = if x < lo { lo } else { x };
-    if x > hi { hi } else { x }
-}
-
-/// The polynomial `c[0] + c[1] x + c[2] x^2 + ...`. Horner's rule runs for even and odd powers side by side, since a
-/// single chain has a longer latency.
-#[inline(always)]
-pub(in crate::vmath) fn polynomial<const N: usize>(x: f64, c: [f64; N]) -> f64 {
-    let x2 = x * x;
-    let (mut last, mut other) = (c[N - 1], c[N - 2]);
-    for i in (0..N - 2).rev() {
-        (last, other) = (other, last.mul_add(x2, c[i]));
-    }
-    last.mul_add(x, other)
 }

@@ -1,6 +1,7 @@
 //! Sine and cosine, of x and of pi x.
 
-use super::{ROUND, polynomial, round_product};
+use super::{ROUND, round_product};
+use crate::vmath::polynomial;
 use std::f64::consts::{FRAC_2_PI, FRAC_PI_2, PI};
 
 /// Largest argument of `sin_quick` and `cos_quick`. The quotient by pi/2 has at most 30 bits there, and its rounding
