@@ -109,6 +109,15 @@ impl Windows {
         }
     }
 
+    /// [`runs`](Self::runs) among all rows of windows, with the best vectors of the machine.
+    #[inline(always)]
+    fn vector_runs(&self, elements: Range<usize>, f: impl FnMut(usize, Range<usize>, usize)) {
+        simd::dispatch(
+            #[inline(always)]
+            || self.runs(elements, 0..self.output[0], f),
+        );
+    }
+
     /// The elements of a channel.
     fn pixels(&self) -> usize {
         self.image[0] * self.image[1]
@@ -197,27 +206,21 @@ impl Windows {
         values: impl Fn(usize, Range<usize>) -> &'a [T],
     ) {
         let step = self.stride[1];
-        simd::dispatch(
+        self.vector_runs(
+            elements,
             #[inline(always)]
-            || {
-                self.runs(
-                    elements,
-                    0..self.output[0],
-                    #[inline(always)]
-                    |k, windows, first| {
-                        let values = values(k, windows);
-                        if step == 1 {
-                            let pixels = &mut image[first..first + values.len()];
-                            for (pixel, &value) in pixels.iter_mut().zip(values) {
-                                *pixel += value;
-                            }
-                        } else {
-                            for (pixel, &value) in image[first..].iter_mut().step_by(step).zip(values) {
-                                *pixel += value;
-                            }
-                        }
-                    },
-                );
+            |k, windows, first| {
+                let values = values(k, windows);
+                if step == 1 {
+                    let pixels = &mut image[first..first + values.len()];
+                    for (pixel, &value) in pixels.iter_mut().zip(values) {
+                        *pixel += value;
+                    }
+                } else {
+                    for (pixel, &value) in image[first..].iter_mut().step_by(step).zip(values) {
+                        *pixel += value;
+                    }
+                }
             },
         );
     }
@@ -229,21 +232,15 @@ impl Windows {
         self.check(plane.len(), out.len(), self.count());
         out.fill(start);
         let step = self.stride[1];
-        simd::dispatch(
+        self.vector_runs(
+            elements,
             #[inline(always)]
-            || {
-                self.runs(
-                    elements,
-                    0..self.output[0],
-                    #[inline(always)]
-                    |_, windows, first| {
-                        let out = &mut out[windows];
-                        let plane = &plane[first..];
-                        for i in 0..out.len() {
-                            out[i] = f(out[i], plane[i * step]);
-                        }
-                    },
-                );
+            |_, windows, first| {
+                let out = &mut out[windows];
+                let plane = &plane[first..];
+                for i in 0..out.len() {
+                    out[i] = f(out[i], plane[i * step]);
+                }
             },
         );
     }
@@ -255,14 +252,7 @@ impl Windows {
     #[track_caller]
     pub fn sums<T: Scalar>(&self, plane: &[T], out: &mut [T]) {
         in_pairs(0..self.kernel_len(), RUN, out, &|elements, out| {
-            self.reduce(
-                elements,
-                plane,
-                out,
-                T::ZERO,
-                #[inline(always)]
-                |sum, x| sum + x,
-            );
+            self.reduce(elements, plane, out, T::ZERO, T::add);
         });
     }
 
@@ -320,24 +310,18 @@ impl Windows {
         assert!(plane.len() <= NONE as usize, "places among {} pixels", plane.len());
         out.fill(NONE);
         let step = self.stride[1];
-        simd::dispatch(
+        self.vector_runs(
+            0..self.kernel_len(),
             #[inline(always)]
-            || {
-                self.runs(
-                    0..self.kernel_len(),
-                    0..self.output[0],
-                    #[inline(always)]
-                    |_, windows, first| {
-                        let (out, best) = (&mut out[windows.clone()], &mut best[windows]);
-                        let pixels = &plane[first..];
-                        for i in 0..out.len() {
-                            let x = pixels[i * step];
-                            let wins = out[i] == NONE || beats(x, best[i]);
-                            best[i] = if wins { x } else { best[i] };
-                            out[i] = if wins { (first + i * step) as u32 } else { out[i] };
-                        }
-                    },
-                );
+            |_, windows, first| {
+                let (out, best) = (&mut out[windows.clone()], &mut best[windows]);
+                let pixels = &plane[first..];
+                for i in 0..out.len() {
+                    let x = pixels[i * step];
+                    let wins = out[i] == NONE || beats(x, best[i]);
+                    best[i] = if wins { x } else { best[i] };
+                    out[i] = if wins { (first + i * step) as u32 } else { out[i] };
+                }
             },
         );
         assert!(!out.contains(&NONE), "a window of {self:?} sees no pixel");
