@@ -154,7 +154,6 @@ macro_rules! scalar {
             }
 
             // SAFETY: the trait says what callers promise.
-            #[cfg(feature = "gemm")]
             unsafe fn gemm_raw(
                 [m, k, n]: [usize; 3],
                 (a, [a_row, a_col]): (*const Self, [isize; 2]),
@@ -163,48 +162,26 @@ macro_rules! scalar {
                 c_row: usize,
                 accumulate: bool,
             ) {
-                // The kernels want columns in order, so this is c^T = b^T a^T; strides are (column, row).
-                let product = $gemm::gemm::$t::get_gemm_fn();
-                let (one, serial) = (1.0, gemm_common::Parallelism::None);
-                // SAFETY: the caller's promise.
-                unsafe {
-                    product(
-                        n,
-                        m,
-                        k,
-                        c,
-                        c_row as isize,
-                        1,
-                        accumulate,
-                        b,
-                        b_row,
-                        b_col,
-                        a,
-                        a_row,
-                        a_col,
-                        one,
-                        one,
-                        false,
-                        false,
-                        false,
-                        serial,
-                    );
+                let c_row = c_row as isize;
+                #[cfg(feature = "gemm")]
+                {
+                    // The kernels want columns in order, so this is c^T = b^T a^T; strides are (column, row).
+                    let product = $gemm::gemm::$t::get_gemm_fn();
+                    let (one, serial) = (1.0, gemm_common::Parallelism::None);
+                    // SAFETY: the caller's promise.
+                    unsafe {
+                        product(
+                            n, m, k, c, c_row, 1, accumulate, b, b_row, b_col, a, a_row, a_col, one, one, false, false,
+                            false, serial,
+                        );
+                    }
                 }
-            }
-
-            // SAFETY: the trait says what callers promise.
-            #[cfg(not(feature = "gemm"))]
-            unsafe fn gemm_raw(
-                [m, k, n]: [usize; 3],
-                (a, [a_row, a_col]): (*const Self, [isize; 2]),
-                (b, [b_row, b_col]): (*const Self, [isize; 2]),
-                c: *mut Self,
-                c_row: usize,
-                accumulate: bool,
-            ) {
-                let beta = if accumulate { 1.0 } else { 0.0 };
-                // SAFETY: the caller's promise.
-                unsafe { $matrixmultiply(m, k, n, 1.0, a, a_row, a_col, b, b_row, b_col, beta, c, c_row as isize, 1) }
+                #[cfg(not(feature = "gemm"))]
+                {
+                    let beta = if accumulate { 1.0 } else { 0.0 };
+                    // SAFETY: the caller's promise.
+                    unsafe { $matrixmultiply(m, k, n, 1.0, a, a_row, a_col, b, b_row, b_col, beta, c, c_row, 1) }
+                }
             }
         }
     };
