@@ -1,9 +1,10 @@
 //! Signals. The first Ctrl-C requests a stop, the second ends the program. SIGTERM and SIGHUP only request a stop.
 
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, PoisonError};
 
 use raygrad::nerf::Error;
+use raygrad::tensor::parallel::locked;
 
 use super::output::{complain, note};
 
@@ -58,7 +59,7 @@ static SAID: Mutex<&str> = Mutex::new("");
 
 /// Sets the line for the first Ctrl-C. Listens from the first call on: a second handler would end the program at once.
 fn set(said: &'static str, promise: &str) {
-    let line = || SAID.lock().unwrap_or_else(PoisonError::into_inner);
+    let line = || locked(&SAID);
     if !std::mem::replace(&mut *line(), said).is_empty() {
         return;
     }

@@ -1,12 +1,12 @@
 //! Progress of long tasks on standard error: a bar on a terminal, periodic lines elsewhere.
 
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use raygrad::nerf::available_memory;
-use raygrad::tensor::parallel;
+use raygrad::tensor::parallel::{self, locked};
 
 use super::interrupt::{self, Stop, Work};
 use super::output;
@@ -33,7 +33,7 @@ impl Progress {
 
     /// Shows that `fraction` of the task is done, with a text.
     pub fn set(&self, fraction: f64, words: impl FnOnce() -> String) {
-        let mut last_line = self.last_line.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut last_line = locked(&self.last_line);
         if !self.bar.is_hidden() {
             self.bar.set_position((fraction.min(1.0) * PARTS as f64) as u64);
             self.bar.set_message(words());

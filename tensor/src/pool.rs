@@ -1,10 +1,11 @@
 //! A pool that reuses the buffers of dropped tensors.
 
 use crate::layout::len_of;
+use crate::parallel::locked;
 use crate::{Scalar, Shape, Tensor};
 use std::collections::HashMap;
 use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 
 /// Reuses the buffers of dropped tensors for new tensors of similar size.
 ///
@@ -94,7 +95,7 @@ impl<T: Scalar> Pool<T> {
 
     fn shelves(&self) -> Option<MutexGuard<'_, Shelves<T>>> {
         // The shelves are whole at every point where a panic could strike, so a poisoned lock is still good.
-        self.0.as_ref().map(|pool| pool.lock().unwrap_or_else(PoisonError::into_inner))
+        self.0.as_ref().map(|pool| locked(pool))
     }
 
     /// Number of elements that this pool has allocated so far. It is constant in a steady state.

@@ -1,9 +1,10 @@
 //! A cache of values that are computed in a background thread.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use raygrad::nerf::Result;
+use raygrad::tensor::parallel::locked;
 
 /// Result of a request to the cache.
 pub enum Cached<V> {
@@ -32,7 +33,7 @@ impl<K: Copy + PartialEq + Send + 'static, V: Send + Sync + 'static> Cache<K, V>
     }
 
     fn lock(&self) -> MutexGuard<'_, State<K, V>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.0)
     }
 
     /// Returns the value of a key. If it is not cached, starts its computation in a thread, which calls `done` at the

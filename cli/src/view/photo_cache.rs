@@ -1,10 +1,11 @@
 //! The images of a run, loaded on demand.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use raygrad::nerf::dataset::{Capture, Frame, Photo, Point, Split, View};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Error, Lens, Model, Result};
+use raygrad::tensor::parallel::locked;
 use raygrad_scenes::{embedded, landscape};
 
 use super::cache::{Cache, Cached};
@@ -167,7 +168,7 @@ impl PhotoCache {
 
     /// An image of a built-in scene.
     fn made(&self, scene: &Scene, entry: &Entry) -> Result<Photo> {
-        let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut made = locked(&self.made);
         let frames = match made.take_if(|(split, _)| *split == entry.split) {
             Some((_, frames)) => frames,
             None => match scene {

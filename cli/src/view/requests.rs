@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use raygrad::tensor::parallel::locked;
 use tokio::sync::Notify;
 
 use super::messages::{self, File, Made, ServerMessage, View};
@@ -73,7 +74,7 @@ pub fn text(tell: &ServerMessage) -> Outgoing {
 
 impl Outbox {
     fn lock(&self) -> MutexGuard<'_, Waiting> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.waiting)
     }
 
     /// Appends a message.
@@ -188,7 +189,7 @@ pub struct Requests {
 
 impl Requests {
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.state)
     }
 
     /// Sets the description of the scene for new pages.
@@ -242,7 +243,7 @@ impl Requests {
         let wish = same.map(|(_, wish)| wish.clone());
         let wish = wish.unwrap_or_else(|| Arc::new(RenderRequest { view, last: Mutex::default() }));
         if let Some(client) = state.clients.get_mut(&client) {
-            let last = wish.last.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            let last = locked(&wish.last).clone();
             client.wish = Some((id, wish));
             // Drops the renders of the old request.
             client.outbox.forget();
@@ -313,7 +314,7 @@ impl Requests {
     pub fn show(&self, wish: &Arc<RenderRequest>, shot: RenderedFrame) {
         let shot = Arc::new(shot);
         let state = self.lock();
-        *wish.last.lock().unwrap_or_else(PoisonError::into_inner) = Some(shot.clone());
+        *locked(&wish.last) = Some(shot.clone());
         for client in state.clients.values() {
             if let Some((id, _)) = client.wish.as_ref().filter(|(_, own)| Arc::ptr_eq(own, wish)) {
                 client.outbox.show(*id, shot.clone());

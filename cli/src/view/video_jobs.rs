@@ -5,9 +5,10 @@ use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
 use raygrad::nerf::{Error, Result};
+use raygrad::tensor::parallel::locked;
 use serde_json::{Value, json};
 
 use super::messages::{ServerMessage, VideoRequest};
@@ -50,7 +51,7 @@ impl VideoJobs {
     }
 
     fn lock(&self) -> MutexGuard<'_, Work> {
-        self.work.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.work)
     }
 
     /// Starts a video and reports its progress to all pages.
