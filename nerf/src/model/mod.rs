@@ -3,18 +3,21 @@
 //! Start with [`Config::preset`] and [`Model`]; a [`Trainer`](crate::Trainer) makes the model for a dataset.
 //! [`CameraOptimizer`] refines poses and [`ExposureModel`] fits exposure per image.
 
+mod adapt;
 mod camera_optimizer;
 pub(crate) mod config;
 mod exposure;
+mod preset;
 mod registry;
 mod scene_box;
 mod store;
 
 pub use camera_optimizer::{CameraOptimizer, CameraOptimizerConfig, PoseMotion, RefinedParam};
 pub(crate) use camera_optimizer::{FOCAL, LENS, POSES};
-pub use config::{Config, GroupConfig, Preset};
+pub use config::{Config, GroupConfig};
 pub(crate) use exposure::{EXPOSURE, VIGNETTING};
 pub use exposure::{ExposureConfig, ExposureModel};
+pub use preset::Preset;
 pub use scene_box::SceneBox;
 
 use crate::Result;

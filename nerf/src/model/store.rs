@@ -100,7 +100,7 @@ mod tests {
     use super::*;
     use crate::dataset::sample::cameras_around;
     use crate::field::{FieldConfig, VoxelConfig};
-    use crate::model::config::Preset;
+    use crate::model::Preset;
     use crate::model::densities;
     use crate::sampling::marching::MarchingConfig;
     use crate::space::occupancy::OccupancyGrid;

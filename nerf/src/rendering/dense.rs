@@ -85,7 +85,7 @@ mod tests {
     use crate::dataset::sample::cameras_around;
     use crate::field::{FieldConfig, VoxelConfig};
     use crate::model::SceneBox;
-    use crate::model::config::{Config, Preset};
+    use crate::model::{Config, Preset};
     use crate::space::occupancy::Skip;
     use glam::DVec3;
     use raygrad_autograd::Real;

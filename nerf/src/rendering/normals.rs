@@ -68,7 +68,7 @@ mod tests {
     use super::*;
     use crate::field::{Density, Field, ViewInputs};
     use crate::model::SceneBox;
-    use crate::model::config::{Config, Preset};
+    use crate::model::{Config, Preset};
     use glam::DVec3;
     use raygrad_autograd::{Tensor, Var};
     use raygrad_nn::Bound;

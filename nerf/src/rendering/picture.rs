@@ -164,7 +164,7 @@ impl Model<f32> {
 mod tests {
     use super::*;
     use crate::model::SceneBox;
-    use crate::model::config::{Config, Preset};
+    use crate::model::{Config, Preset};
     use raygrad_tensor::Real;
 
     fn model() -> Model<f32> {

@@ -105,7 +105,7 @@ fn failed(error: StateError) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::config::{GroupConfig, Preset};
+    use crate::model::{GroupConfig, Preset};
     use raygrad_autograd::Tensor;
 
     #[test]

@@ -8,7 +8,7 @@ use crate::camera::rays::stratified;
 use crate::dataset::{Split, sample::ball};
 use crate::field::{FieldConfig, VoxelConfig};
 use crate::imaging::metrics::psnr;
-use crate::model::config::{Config, Preset};
+use crate::model::{Config, Preset};
 use crate::random::Jitter;
 use crate::sampling::marching::MarchingConfig;
 use crate::training::trainer::Trainer;
