@@ -1,19 +1,19 @@
 //! `docs/reference/config.md`: every key of `config.json`. Types and descriptions come from the sources, and defaults
 //! from the presets. Ranges come from the errors of [`Config::check`] for extreme values.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fmt::Write;
 
-use glam::{DMat3, DVec2, DVec3};
-use raygrad::nerf::{Config, Error, Model, Ndc, Preset};
+use raygrad::nerf::{Error, Model};
 use serde_json::{Value, json};
 
+use super::samples::{Keys, Origin, Samples, at};
 use super::source::{Field, Sources};
 use super::{compare, markdown, wrap};
 use crate::run::RunConfig;
 
 /// Titles and introductions of the sections, by name of the struct or enum.
-const TITLES: [(&str, &str, &str); 29] = [
+const TITLES: [(&str, &str, &str); 30] = [
     ("RunConfig", "Run", "The keys at the top of `config.json`."),
     ("Scene", "Scene", "A word, or an object with a folder."),
     ("SceneBox", "Scene box", "The region that the model covers."),
@@ -55,132 +55,12 @@ const TITLES: [(&str, &str, &str); 29] = [
         "Camera optimizer",
         "Optimization of focal lengths and lenses. The learning rate of poses is the key `poses`.",
     ),
+    ("ExposureConfig", "Exposure model", "What is learned of how images show the scene's colours."),
 ];
-/// The last entry.
-const EXPOSURE: (&str, &str, &str) =
-    ("ExposureConfig", "Exposure model", "What is learned of how images show the scene's colours.");
 
 fn title(name: &str) -> (&'static str, &'static str) {
-    let all = TITLES.iter().chain([&EXPOSURE]);
-    let found = all.into_iter().find(|(own, ..)| *own == name);
+    let found = TITLES.iter().find(|(own, ..)| *own == name);
     found.map(|(_, title, text)| (*title, *text)).unwrap_or_else(|| panic!("`{name}` needs a title in TITLES"))
-}
-
-/// Origin of a sample configuration.
-#[derive(Clone, Copy, PartialEq)]
-enum Origin {
-    Preset(&'static str),
-    /// A file with the required keys only.
-    Minimal,
-    /// A file with all keys.
-    Full,
-    /// The keys that a minimal file lacks.
-    Absent,
-}
-
-/// Sample configurations of runs, which together have every key.
-fn samples() -> Vec<(Origin, Value)> {
-    let preset = |preset: Preset| serde_json::to_value(Config::preset(preset)).unwrap();
-    let run = |config: Value| {
-        json!({
-            "raygrad": env!("CARGO_PKG_VERSION"),
-            "scene": "embedded",
-            "downscale": 1,
-            "scene_box": {"bounds": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], "near_far": [0.5, 6.0]},
-            "viewpoint": {"width": 24, "height": 24, "angle_x": 0.7, "distance": 4.0, "elevation": 0.5},
-            "config": config,
-        })
-    };
-    let instant = preset(Preset::Instant);
-    let with = |key: &str, value: Value| {
-        let mut config = instant.clone();
-        config[key] = value;
-        run(config)
-    };
-    let mut samples = vec![];
-    for (name, each) in
-        [("classic", Preset::Classic), ("small", Preset::Small), ("instant", Preset::Instant), ("voxel", Preset::Voxel)]
-    {
-        samples.push((Origin::Preset(name), run(preset(each))));
-    }
-    let constant = json!({"constant": {"rate": 0.1}});
-    for (key, value) in [
-        ("sampler", json!({"kind": "proposal"})),
-        ("sampler", json!({"kind": "marching"})),
-        ("groups", json!([{"params": "field.", "adam": instant["adam"], "schedule": constant}])),
-        ("loss_terms", json!([{"kind": "total_variation", "weight": 0.1, "params": "field.table"}])),
-    ] {
-        samples.push((Origin::Minimal, with(key, value)));
-    }
-    let ramp = json!({"from": 0.1, "to": 0.01, "warmup": 0.1});
-    let step = json!({"step": {"from": 0.1, "factor": 0.5, "every": 0.1, "warmup": 0.1}});
-    for schedule in [constant, step, json!({"linear": ramp}), json!({"exponential": ramp}), json!({"cosine": ramp})] {
-        let group = json!([{"params": "field.", "adam": instant["adam"], "schedule": schedule}]);
-        let [optics, colors] = [["focal", "lens"], ["exposure", "vignetting"]];
-        let both = |[a, b]: [&str; 2]| json!({a: schedule, b: schedule});
-        for (key, value) in [
-            ("schedule", schedule.clone()),
-            ("poses", schedule.clone()),
-            ("groups", group),
-            ("camera_optimizer", both(optics)),
-            ("exposure_model", both(colors)),
-        ] {
-            samples.push((Origin::Full, with(key, value)));
-        }
-    }
-    for kind in ["distortion", "entropy", "orientation", "depth"] {
-        samples.push((Origin::Full, with("loss_terms", json!([{"kind": kind, "weight": 0.1}]))));
-    }
-    samples.push((Origin::Full, with("loss", json!({"huber": {"delta": 0.1}}))));
-    let adaptive = json!({"kind": "marching", "quadrature": {"adaptive": {"tolerance": 1e-3}}, "last_step": 0.002});
-    samples.push((Origin::Full, with("sampler", adaptive)));
-    let slopes = DVec2::ONE.to_array();
-    let ndc = Ndc { eye: DVec3::ZERO, axes: DMat3::IDENTITY, slopes, near: 1.0 };
-    for (key, value) in [
-        ("scene", json!({"folder": "my-scene"})),
-        ("budget", json!({"steps": 5000})),
-        ("budget", json!({"seconds": 60.0})),
-        ("scene_box", json!({"bounds": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], "near_far": [0.5, 6.0], "ndc": ndc})),
-    ] {
-        let mut sample = run(instant.clone());
-        sample[key] = value;
-        samples.push((Origin::Full, sample));
-    }
-    samples
-}
-
-/// The values of a sample's keys by path: `config.sampler{marching}.step`, `config.groups[].params`.
-type Keys = BTreeMap<String, Vec<Value>>;
-
-/// Collects the keys of a value with their values.
-fn walk(value: &Value, path: &str, keys: &mut Keys) {
-    match value {
-        Value::Object(fields) => {
-            let kind = fields.get("kind").and_then(Value::as_str).map(|kind| format!("{{{kind}}}")).unwrap_or_default();
-            for (name, value) in fields.iter().filter(|(name, _)| *name != "kind") {
-                let path = format!("{path}{kind}.{name}");
-                walk(value, &path, keys);
-                keys.entry(path).or_default().push(value.clone());
-            }
-        }
-        Value::Array(all) => all.iter().for_each(|value| walk(value, &format!("{path}[]"), keys)),
-        _ => {}
-    }
-}
-
-/// The value at a path; the first element of lists.
-fn at<'a>(value: &'a mut Value, path: &str) -> Option<&'a mut Value> {
-    path.split('.').skip(1).try_fold(value, |value, part| {
-        let name = part.split(['[', '{']).next()?;
-        let mut value = value.get_mut(name)?;
-        if part.contains("[]") {
-            value = value.get_mut(0)?;
-        }
-        match part.split_once('{') {
-            Some((_, kind)) if value["kind"] != kind.trim_end_matches('}') => None,
-            _ => Some(value),
-        }
-    })
 }
 
 /// A struct or an enum, and its paths.
@@ -242,8 +122,7 @@ impl Schema<'_> {
             for (kind, _, name) in kinds {
                 self.visit(name, Some(kind), &format!("{below}{{{kind}}}"));
             }
-        } else if self.sources.get(ty).is_some_and(|item| !item.fields.is_empty() || !item.variants.iter().all(is_word))
-        {
+        } else if self.sources.get(ty).is_some() && words(self.sources, ty).is_none() {
             self.visit(ty, None, &below);
         }
     }
@@ -252,6 +131,12 @@ impl Schema<'_> {
 /// Returns true if files hold a variant as a word.
 fn is_word(variant: &Field) -> bool {
     variant.ty.is_empty() && variant.fields.is_empty()
+}
+
+/// The variants of an enum of words.
+fn words<'a>(sources: &'a Sources, ty: &str) -> Option<&'a [Field]> {
+    let item = sources.get(ty).filter(|item| item.fields.is_empty() && item.variants.iter().all(is_word))?;
+    Some(&item.variants)
 }
 
 fn schema(sources: &Sources) -> Schema<'_> {
@@ -362,11 +247,9 @@ fn type_words(sources: &Sources, ty: &str) -> String {
         "DMat3" => "9 numbers".into(),
         "[f64; 2]" => "2 numbers".into(),
         "[DVec3; 2]" => "2 points of 3 numbers".into(),
+        _ if words(sources, ty).is_some() => "word".into(),
         _ => {
-            let item = sources.get(ty).unwrap_or_else(|| panic!("a type `{ty}` without words"));
-            if item.fields.is_empty() && item.variants.iter().all(is_word) {
-                return "word".into();
-            }
+            assert!(sources.get(ty).is_some(), "a type `{ty}` without words");
             let title = title(ty).0;
             format!("[{title}](#{})", anchor(title))
         }
@@ -458,13 +341,10 @@ fn entry(schema: &Schema<'_>, section: &Section, field: &Field, below: &str, sam
     if !field.ty.is_empty() {
         facts.push(format!("Type: {}", type_words(sources, &field.ty)));
     }
-    let (ty, _) = inner(&field.ty);
-    if let Some(item) = sources.get(ty)
-        && item.fields.is_empty()
-        && item.variants.iter().all(is_word)
-    {
-        let words: Vec<String> = item.variants.iter().map(|word| format!("`{}`", word.name)).collect();
-        facts.push(format!("Values: {}", words.join(", ")));
+    let words = words(sources, inner(&field.ty).0);
+    if let Some(words) = words {
+        let names: Vec<String> = words.iter().map(|word| format!("`{}`", word.name)).collect();
+        facts.push(format!("Values: {}", names.join(", ")));
     }
     facts.extend(unit.map(|unit| format!("Unit: {unit}")));
     let path = format!("{}{below}.{}", section.paths[0], field.name);
@@ -496,13 +376,8 @@ fn entry(schema: &Schema<'_>, section: &Section, field: &Field, below: &str, sam
         page.insert(page.len() - 1, '\\');
         page += &wrap(indent, indent, &facts.iter().map(|fact| format!("{fact}.")).collect::<Vec<_>>().join(" "));
     }
-    if let Some(item) = sources.get(inner(&field.ty).0)
-        && item.fields.is_empty()
-        && item.variants.iter().all(is_word)
-    {
-        for word in &item.variants {
-            page += &word_entry(word, &format!("{indent}- "));
-        }
+    for word in words.into_iter().flatten() {
+        page += &word_entry(word, &format!("{indent}- "));
     }
     page
 }
@@ -513,40 +388,6 @@ fn word_entry(word: &Field, bullet: &str) -> String {
     let indent = " ".repeat(bullet.len());
     let earlier: String = word.aliases.iter().map(|name| format!(" Earlier name: `{name}`.")).collect();
     wrap(bullet, &indent, &format!("`{}`: {}{earlier}", word.name, markdown(&text)))
-}
-
-/// The samples and their keys.
-struct Samples {
-    values: Vec<(Origin, Value)>,
-    keys: Vec<(Origin, Keys)>,
-}
-
-impl Samples {
-    fn new() -> Self {
-        let (mut values, mut keys) = (vec![], vec![]);
-        for (origin, written) in samples() {
-            let read: RunConfig = serde_json::from_value(written.clone()).unwrap();
-            let value = serde_json::to_value(read).unwrap();
-            let (mut before, mut after) = (Keys::new(), Keys::new());
-            walk(&written, "", &mut before);
-            walk(&value, "", &mut after);
-            if origin == Origin::Minimal {
-                keys.push((
-                    Origin::Absent,
-                    after.clone().into_iter().filter(|(path, _)| !before.contains_key(path)).collect(),
-                ));
-            }
-            keys.push((origin, after));
-            values.push((origin, value));
-        }
-        Samples { values, keys }
-    }
-
-    /// Returns true if presets have the key or a file may omit it.
-    fn has_default(&self, path: &str) -> bool {
-        let is_said = |origin: &Origin| matches!(origin, Origin::Preset(_) | Origin::Absent);
-        self.keys.iter().any(|(origin, keys)| is_said(origin) && keys.contains_key(path))
-    }
 }
 
 fn page() -> String {

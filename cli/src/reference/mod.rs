@@ -3,6 +3,7 @@
 
 mod commands;
 mod config;
+mod samples;
 mod source;
 
 use std::path::{Path, PathBuf};
