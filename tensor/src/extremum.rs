@@ -45,23 +45,9 @@ pub fn extremum<T: Scalar>(x: &[T], middle: Middle, greatest: bool, out: &mut [T
 /// [`extremum`] of the columns from `first` on: all columns, or some of one group.
 fn columns<T: Scalar>(x: &[T], middle: Middle, first: usize, greatest: bool, out: &mut [T]) {
     if greatest {
-        along(
-            x,
-            middle,
-            first,
-            out,
-            #[inline(always)]
-            |a, b| a.maximum(b),
-        );
+        along(x, middle, first, out, T::maximum);
     } else {
-        along(
-            x,
-            middle,
-            first,
-            out,
-            #[inline(always)]
-            |a, b| a.minimum(b),
-        );
+        along(x, middle, first, out, T::minimum);
     }
 }
 

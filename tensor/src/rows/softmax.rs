@@ -15,6 +15,16 @@ fn top<T: Scalar>(x: &[T]) -> T {
     )
 }
 
+/// The smallest element of a row without NaN.
+#[inline(always)]
+fn bottom<T: Scalar>(x: &[T]) -> T {
+    fold_lanes(
+        x,
+        #[inline(always)]
+        |a, b| if b < a { b } else { a },
+    )
+}
+
 /// `out = x - shift` for each row of the block. `shift` is the row's largest element, or 0 if that is infinite and
 /// `limits` is set. The shifts go to `shifts`.
 #[inline(always)]
@@ -54,13 +64,8 @@ pub fn corrected<T: Scalar>(power: T, x: T, shift: T) -> T {
 fn exponentials_of_shifted<T: Scalar>(x: &[T], n: usize, out: &mut [T], shifts: &[T]) {
     exponentials(out);
     for ((x, out), &shift) in x.chunks_exact(n).zip(out.chunks_exact_mut(n)).zip(shifts) {
-        let least = fold_lanes(
-            x,
-            #[inline(always)]
-            |a, b| if b < a { b } else { a },
-        );
         // Up to there, the rounding error is at most two units of the power.
-        if shift - least > T::from_f64(8.0) {
+        if shift - bottom(x) > T::from_f64(8.0) {
             for (out, &x) in out.iter_mut().zip(x) {
                 *out = corrected(*out, x, shift);
             }
@@ -87,12 +92,7 @@ fn lifts<T: Scalar>(factor: T, powers: &[T]) -> bool {
     if factor.abs() <= T::ONE {
         return false;
     }
-    let smallest = fold_lanes(
-        powers,
-        #[inline(always)]
-        |a, b| if b < a { b } else { a },
-    );
-    smallest < T::from_f64(power_of_two(if size_of::<T>() == 4 { -126 } else { -1022 }))
+    bottom(powers) < T::from_f64(power_of_two(if size_of::<T>() == 4 { -126 } else { -1022 }))
 }
 
 /// `out = e^(x - shift) * factor`, where the power may underflow and the factor brings it back.
