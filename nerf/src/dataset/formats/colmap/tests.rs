@@ -356,7 +356,8 @@ fn binary_errors_name_the_entry() {
     let mut longer = binary();
     longer.iter_mut().for_each(|bytes| bytes.extend([1, 2, 3]));
     for (which, list) in [(0, "cameras"), (1, "images")] {
-        let what = "3 bytes follow the last of 2 entries: copy the file again, or convert it with COLMAP's `model_converter`";
+        let what =
+            "3 bytes follow the last of 2 entries: copy the file again, or convert it with COLMAP's `model_converter`";
         fails(Binary, which, &longer[which], &format!("`{list}`"), what);
     }
     let [cameras, images, _] = binary();
