@@ -97,7 +97,7 @@ fn transforms_paths_outside_are_never_written() {
     });
     let frames: Vec<Value> = frames.collect();
     let write = |frames: &[Value]| {
-        let all = json!({ "camera_angle_x": 0.69, "k1": 0.01, "frames": frames });
+        let all = json!({ "camera_angle_x": 0.69, "k1": 0.01, "depth_unit_scale_factor": 0.01, "frames": frames });
         std::fs::write(place.path("work/scene/transforms.json"), all.to_string()).unwrap();
     };
     write(&frames);
