@@ -26,7 +26,9 @@ pub fn of(capture: &Capture) -> Result<(Vec<[f64; 2]>, usize)> {
         // Training refuses the images, but the cameras have a scene box.
         Err(error) => {
             let analysis = SceneAnalysis::new(capture, None, None)?;
-            complain(&format!("warning: {error}"));
+            complain(&format!(
+                "warning: near and far come from the cameras alone, because training refuses these images: {error}"
+            ));
             analysis
         }
     };

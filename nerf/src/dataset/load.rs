@@ -7,7 +7,7 @@ use super::frames::{CHOOSE, Dataset, Frame, Split, evenly_spaced};
 use super::hold_out::split_of;
 use super::lens_mask::seen_pixels;
 use super::mask::Mask;
-use super::photo::{Header, Photo};
+use super::photo::{Header, OPAQUE, Photo};
 use super::scene_analysis::{EmptyBackground, SceneAnalysis};
 use super::scene_transform::SceneTransform;
 use super::scene_type::SceneType;
@@ -28,8 +28,6 @@ const HELD_OUT: usize = 8;
 const LOOKED_AT: usize = 3;
 /// The transparent share of an image from which its background counts as empty.
 const CLEAR: f64 = 0.05;
-/// The least alpha of an opaque pixel: 8-bit rounding may leave 254 of 255.
-const OPAQUE: f32 = 0.99;
 /// The white share of the border from which an image shows an object in front of white.
 const WHITE_BORDER: f64 = 0.98;
 /// The largest downscale factor that is suggested.

@@ -9,7 +9,7 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
 use raygrad_tensor::simd;
 use std::fs::File;
-use std::hash::{DefaultHasher, Hash, Hasher};
+use std::hash::{Hash, Hasher};
 use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
@@ -22,6 +22,9 @@ pub(crate) mod save;
 pub(crate) mod sharpness;
 mod start;
 pub(crate) mod unsupported;
+
+/// The least alpha of an opaque pixel: 8-bit rounding may leave 254 of 255.
+pub(super) const OPAQUE: f32 = 0.99;
 
 /// An RGB or RGBA image with the integers of its file: three or four bytes per pixel, twice that for 16 bits.
 ///
@@ -83,13 +86,12 @@ impl Photo {
     /// Without such a profile colours [count as sRGB](Self::has_unread_profile).
     ///
     /// # Errors
-    /// If the file cannot be read or decoded, or ends within its pixels (a JPEG may lack its end marker alone). If it
-    /// claims more than 2^28 pixels or more than 64 MiB plus 16 KiB per byte of the file, or needs more memory than is
-    /// free. The error names it.
+    /// If the file cannot be read or decoded, or ends within its pixels. If it claims more than 2^28 pixels or more than
+    /// 64 MiB plus 16 KiB per byte of the file, or needs more memory than is free. The error names it.
     pub fn open(path: impl AsRef<Path>, size: Option<[usize; 2]>) -> Result<Self> {
         let path = path.as_ref();
         let (mut decoder, stored) = decoder_within_memory(path)?;
-        if Self::file_lacks_end(path)? && !has_all_pixels(path)? {
+        if is_cut_jpeg(path)? {
             let what = "ends within its pixels: copy it again, or save it again with another program";
             return Err(Error::file(path, what));
         }
@@ -172,14 +174,6 @@ impl Photo {
         Ok(matches!(Profile::of(&mut decoder(path.as_ref())?.0), Profile::Unread))
     }
 
-    /// Reads whether a file is a JPEG without the marker that ends its pixels: decoders invent missing ones.
-    ///
-    /// # Errors
-    /// If the file cannot be read.
-    pub fn file_lacks_end(path: impl AsRef<Path>) -> Result<bool> {
-        lacks_end(path.as_ref())
-    }
-
     /// Returns the share of fully transparent pixels, 0 to 1.
     pub fn transparent_share(&self) -> f64 {
         let clear = self.pixels().filter(|pixel| pixel[3] == 0.0);
@@ -209,7 +203,7 @@ impl Photo {
 
     /// The share of the one-pixel border that is opaque: 0 to 1.
     pub(crate) fn opaque_border(&self) -> f64 {
-        self.border(|pixel| pixel[3] == 1.0)
+        self.border(|pixel| pixel[3] >= OPAQUE)
     }
 
     /// The share of the pixels of the border that pass a test: 0 to 1.
@@ -558,23 +552,8 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
     Ok((decoder, size))
 }
 
-/// Returns true if a JPEG file without an end marker has all pixels: bytes behind them do not change any.
-fn has_all_pixels(path: &Path) -> Result<bool> {
-    let bytes = std::fs::read(path).map_err(|e| Error::file(path, format!("cannot be read: {e}")))?;
-    let bytes = bytes.strip_suffix(&[0xff]).unwrap_or(&bytes);
-    let decoded = |behind: u8| {
-        let ended = [bytes, &[behind; 64], &[0xff, 0xd9]].concat();
-        let (decoder, _) = decoder_of(Cursor::new(&ended), ended.len() as u64, path).ok()?;
-        let mut hasher = DefaultHasher::new();
-        DynamicImage::from_decoder(decoder).ok()?.as_bytes().hash(&mut hasher);
-        Some(hasher.finish())
-    };
-    let first = decoded(0);
-    Ok(first.is_some() && first == decoded(0x55))
-}
-
-/// See [`Photo::file_lacks_end`].
-fn lacks_end(path: &Path) -> Result<bool> {
+/// Returns true for a JPEG file without the marker that ends its pixels: decoders invent what is missing.
+fn is_cut_jpeg(path: &Path) -> Result<bool> {
     let (start, _) = start_of(path)?;
     if !start.starts_with(JPEG) {
         return Ok(false);

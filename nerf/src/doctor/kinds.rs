@@ -208,7 +208,7 @@ kinds! {
         "Alpha then says nothing about the background. For an object on an empty background, save it with alpha 0.";
     /// Images are transparent within an opaque border.
     HollowAlpha = "hollow-alpha", Warning,
-        "the alpha channel of {} is transparent in the middle and opaque along the border",
+        "the alpha channel of {} is transparent inside an opaque border",
         "Alpha is 0 where the background is empty. If it is 0 on the object, invert it. To hide something that moved, \
          use masks.";
     /// Colour profiles cannot be read.
@@ -216,10 +216,6 @@ kinds! {
         "cannot read the colour profile of {}; colours count as sRGB",
         "Nothing to do if the colours look right. Otherwise convert the images to sRGB. raygrad reads RGB profiles \
          with a matrix and curves.";
-    /// JPEG files lack their end marker.
-    MissingEnd = "missing-end", Note,
-        "the end marker of {} is missing, but no pixel",
-        "Nothing to do in raygrad. Other programs may refuse these JPEG files: save them again.";
     /// Single images do not match their cameras.
     WrongPose = "wrong-pose", Warning,
         "cannot match {} with neighbouring images at the places that the poses predict",

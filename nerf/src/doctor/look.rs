@@ -28,8 +28,6 @@ pub(super) struct Look {
     pub hollow: bool,
     /// True if the colour profile cannot be read.
     pub unread_profile: bool,
-    /// True if the file is a JPEG without its end marker.
-    pub lacks_end: bool,
     /// Equal for equal images.
     pub hash: u64,
     /// The logarithm of the variance of the Laplacian over the variance of the brightness; `None` of a flat image.
@@ -66,7 +64,6 @@ fn look_at(view: &View) -> Result<Look> {
     let size = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera));
     let photo = Photo::open(&path, size)?;
     let unread_profile = Photo::has_unread_profile(&path)?;
-    let lacks_end = Photo::file_lacks_end(&path)?;
     let transparent = photo.has_alpha().then(|| photo.transparent_share() > 0.0);
     let hollow = photo.transparent_share() > HOLLOW && photo.opaque_border() > OPAQUE_BORDER;
     let [middle, small] = [LONGEST, SMALL].map(|longest| photo.at_most(longest));
@@ -81,7 +78,7 @@ fn look_at(view: &View) -> Result<Look> {
     let picture = size.and_then(|_| Picture::new(&view.camera, &small, mask.as_ref()));
     let sharpness = sharpness(&grey(&middle, mean(&small.to_image())));
     let hash = hasher.finish();
-    Ok(Look { transparent, hollow, unread_profile, lacks_end, hash, sharpness, luminance, balance, used, picture })
+    Ok(Look { transparent, hollow, unread_profile, hash, sharpness, luminance, balance, used, picture })
 }
 
 /// See [`Look::sharpness`].

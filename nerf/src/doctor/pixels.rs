@@ -94,7 +94,6 @@ pub(super) fn examine(seen: &[Seen<'_>], findings: &mut Findings) {
     alpha(seen, findings);
     let unread = seen.iter().filter(|one| one.look.unread_profile);
     findings.about(Kind::ColorProfile, unread.map(|one| one.view), &[]);
-    findings.about(Kind::MissingEnd, seen.iter().filter(|one| one.look.lacks_end).map(|one| one.view), &[]);
 }
 
 fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
@@ -296,7 +295,6 @@ mod tests {
                     transparent: None,
                     hollow: false,
                     unread_profile: false,
-                    lacks_end: false,
                     hash: 0,
                     sharpness: (i % 5 != 2).then(&mut number),
                     luminance: None,

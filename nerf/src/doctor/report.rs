@@ -129,6 +129,9 @@ impl Report {
 #[derive(Debug, Default)]
 pub(super) struct Findings(pub Vec<Finding>);
 
+/// Findings that are the reason of a refusal.
+const STATED: [FindingKind; 3] = [FindingKind::ImagesAbsent, FindingKind::FewImages, FindingKind::OnePlace];
+
 impl Findings {
     /// Adds a finding; `parts` take the places of `{}` in the message of its kind.
     pub fn add(&mut self, kind: FindingKind, parts: &[&dyn Display]) -> &mut Finding {
@@ -169,10 +172,10 @@ impl Findings {
     }
 
     /// Sorts them: the most severe first, then in the order of their kinds. Adds why training refuses the capture,
-    /// unless an error is found.
+    /// unless a finding says it.
     pub fn sorted(mut self, refusal: Option<&Error>) -> Vec<Finding> {
         if let Some(error) = refusal
-            && self.0.iter().all(|finding| finding.severity < Severity::Error)
+            && !self.0.iter().any(|finding| finding.severity == Severity::Error && STATED.contains(&finding.kind))
         {
             self.add(FindingKind::Refused, &[error]);
         }

@@ -33,8 +33,8 @@ const EXPORTS: [(&str, &str, &str); 18] = [
 /// Endings of archives. Those of Record3D are zip files.
 const ARCHIVES: [&str; 7] = ["zip", "r3d", "7z", "rar", "tar", "gz", "tgz"];
 
-/// The deepest folder that is searched for a description in an unusual place.
-const DEEPEST: usize = 4;
+/// The deepest folders that are searched for a description in an unusual place: the first, and if these hold none.
+const DEEPEST: [usize; 2] = [3, 4];
 
 /// The files that describe a capture.
 #[derive(Debug, Clone, PartialEq)]
@@ -134,8 +134,13 @@ fn is_transforms(name: &str) -> bool {
 
 /// The descriptions in unusual places in or below a folder without [usual ones](descriptions).
 fn elsewhere(folder: &Path) -> Vec<Description> {
+    DEEPEST.into_iter().map(|deepest| within(folder, deepest)).find(|found| !found.is_empty()).unwrap_or_default()
+}
+
+/// The descriptions in a folder and `deepest` levels below it.
+fn within(folder: &Path, deepest: usize) -> Vec<Description> {
     let mut out = vec![];
-    for directory in walk(folder, DEEPEST) {
+    for directory in walk(folder, deepest) {
         let place = folder.join(&directory.inside);
         let names = directory.names().into_iter().filter(|name| name.to_str().is_some_and(is_transforms));
         out.extend(names.map(|name| Description::new(Format::Transforms, &place, place.join(name))));
@@ -228,7 +233,10 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
                 "`{image}` is not beside `{model}`, which may have undistorted images of its own: to use these images, \
                  move the model to `sparse/0`"
             )),
-            Some(_) => capture = around,
+            Some(image) => {
+                capture = around;
+                capture.assumptions.push(format!("no images are beside `{model}`: used others, such as `{image}`"));
+            }
             None => {}
         }
     }

@@ -300,8 +300,8 @@ fn short_depths(views: &[View], folder: &Path) -> Option<String> {
     }
     let (path, most) = (path.strip_prefix(folder).unwrap_or(path).display(), 255.0 * unit);
     Some(format!(
-        "depth images have 8 bits, such as `{path}`: in units of {unit}, no depth exceeds {most}; give the right unit \
-         as `depth_unit_scale_factor`"
+        "depth images have 8 bits, such as `{path}`: in units of {unit}, no depth exceeds {most}; check \
+         `depth_unit_scale_factor`"
     ))
 }
 

@@ -166,16 +166,25 @@ impl Layers<'_, '_> {
         let centre = [0, 1].map(|i| given[i].unwrap_or(middle[i]));
         let from = |[x, y]: [f64; 2]| (centre[0] - x).hypot(centre[1] - y);
         let is_oblong = middle[0].max(middle[1]) > OBLONG * middle[0].min(middle[1]);
-        if is_oblong && given != [None; 2] && from([middle[1], middle[0]]) < TURNED * from(middle) {
+        // A frame's own crop may lie anywhere.
+        let is_shared = given != [None; 2] && self.own_centre()? == [None; 2];
+        if is_oblong && is_shared && from([middle[1], middle[0]]) < TURNED * from(middle) {
+            let swapped = if self.size()?.is_some() { ", or swap `w` and `h`" } else { "" };
+            let name = MATRICES.into_iter().find(|name| self.top.get(name).is_some());
             let what = format!(
-                "and `cy` are {} and {}, the middle of {height}x{width} pixels, but the image of {} has \
-                 {width}x{height}: it was turned, so give its own principal point",
+                "gives the principal point {}, {}, the middle of {height}x{width} pixels, but {} has {width}x{height}: \
+                 give the frame's own `cx` and `cy`{swapped}",
                 centre[0], centre[1], self.frame.path
             );
-            return Err(self.error("cx", what));
+            return Err(self.top.error(name.filter(|_| self.top.get("cx").is_none()).unwrap_or("cx"), what));
         }
         let focal = self.focal([width, height], angle_y)?;
         Ok(Camera { width, height, focal, centre, lens, pose })
+    }
+
+    /// The principal point that the frame gives.
+    fn own_centre(&self) -> Result<[Option<f64>; 2]> {
+        Layers { top: self.frame, frame: self.frame }.centre()
     }
 
     /// The principal point, if the frame or the file gives it.

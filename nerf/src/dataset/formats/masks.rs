@@ -30,14 +30,28 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) -> Result<()> {
         let exact = paths.clone().find(|path| path.is_file());
         view.mask = exact.or_else(|| paths.find_map(|path| in_any_case(&mut listings, &path)));
     }
-    let mut owners: HashMap<&Path, &View> = HashMap::new();
-    for view in capture.present() {
-        let Some(mask) = &view.mask else { continue };
-        let first = *owners.entry(mask).or_insert(view);
-        if first.image != view.image {
-            let (mask, [one, two]) = (mask.display(), [first, view].map(|view| &view.name));
-            let what = format!("has a mask that also fits `{one}`, {mask}: name masks `{one}.png` and `{two}.png`");
-            return Err(Error::field(&capture.file, &view.field, what));
+    let mut owners: HashMap<PathBuf, usize> = HashMap::new();
+    for i in 0..capture.views.len() {
+        let view = &capture.views[i];
+        let Some(mask) = view.mask.clone().filter(|_| view.image.is_some()) else { continue };
+        let first = *owners.entry(mask.clone()).or_insert(i);
+        if capture.views[first].image == view.image {
+            continue;
+        }
+        // A mask with an image's exact name is that image's alone.
+        let [other, name] = [first, i].map(|i| &capture.views[i].name);
+        match [other, name].map(|name| mask.ends_with(name)) {
+            [true, false] => capture.views[i].mask = None,
+            [false, true] => {
+                owners.insert(mask, i);
+                capture.views[first].mask = None;
+            }
+            _ => {
+                let mask = mask.display();
+                let what =
+                    format!("has a mask that also fits `{other}`, {mask}: name masks `{other}.png` and `{name}.png`");
+                return Err(Error::field(&capture.file, &view.field, what));
+            }
         }
     }
     let present = capture.present().count();
@@ -185,11 +199,16 @@ mod tests {
             let name = |view: &View| Some(view.mask.as_ref()?.file_name()?.to_str()?.to_owned());
             Ok::<_, String>(capture.views.iter().map(name).collect::<Vec<_>>())
         };
-        let message = check(&["0.png"]).unwrap_err();
-        assert!(message.contains("has a mask that also fits `0.png`, ") && message.contains("masks/0.png: name masks"));
+        let message = check(&["0.webp"]).unwrap_err();
+        assert!(
+            message.contains("has a mask that also fits `0.png`, ") && message.contains("masks/0.webp: name masks")
+        );
         assert!(message.ends_with("`0.png.png` and `0.jpg.png`"), "{message}");
         let [own, other] = ["0.png", "0.jpg.png"].map(|name| Some(name.to_owned()));
-        assert_eq!(check(&["0.png", "0.jpg.png"]), Ok(vec![own, other]));
+        assert_eq!(check(&["0.png", "0.jpg.png"]), Ok(vec![own.clone(), other]));
+        // The exact name of one.
+        assert_eq!(check(&["0.png"]), Ok(vec![own, None]));
+        assert_eq!(check(&["0.jpg"]), Ok(vec![None, Some("0.jpg".to_owned())]));
     }
 
     /// The file name of each view's dynamic mask, and the notes, of images and masks with these names.

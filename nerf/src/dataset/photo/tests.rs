@@ -142,12 +142,7 @@ fn jpeg_that_ends_within_its_pixels_is_an_error() {
     for whole in [&plain, &with_thumbnail] {
         assert_eq!(open(whole), Ok(()));
         assert_eq!(open(&[whole, &b"a video behind the image"[..]].concat()), Ok(()));
-        let pixels = Photo::open(&path, None).unwrap();
-        for end in [whole.len() - 2, whole.len() - 1] {
-            assert_eq!(open(&whole[..end]), Ok(()), "the end marker alone");
-            assert!(Photo::file_lacks_end(&path).unwrap() && Photo::open(&path, None).unwrap() == pixels);
-        }
-        for end in [whole.len() / 2, whole.len() - 300, whole.len() - 4, whole.len() - 3] {
+        for end in [whole.len() / 2, whole.len() - 300, whole.len() - 2, whole.len() - 1] {
             let message = open(&whole[..end]).unwrap_err();
             assert!(message.contains("cut.jpg: ends within its pixels: copy it again"), "{end}: {message}");
         }

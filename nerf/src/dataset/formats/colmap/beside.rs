@@ -17,7 +17,7 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     // to the folder of the capture.
     let folders = IMAGES.map(|name| root.join(name));
     let mut images: Vec<PathBuf> = folders.into_iter().filter(|folder| folder.is_dir()).collect();
-    if model.strip_prefix(&root).is_ok_and(|inside| inside.starts_with("distorted")) {
+    if model.strip_prefix(&root).is_ok_and(|inside| inside.iter().any(|part| part == "distorted")) {
         // 3D Gaussian Splatting keeps undistorted images in `images`, and those of this model in `input`.
         images.reverse();
     }

@@ -199,7 +199,10 @@ fn captures_are_found_in_unusual_places() {
         let path = folder.path();
         let capture = read(path, None).unwrap();
         assert_eq!((capture.present().count(), &capture.folder), (3, &path.join(root)), "{file}");
-        assert_eq!(capture.assumptions, [format!("the usual places hold no capture: used `{file}`")]);
+        let (used, others) = capture.assumptions.split_first().unwrap();
+        assert_eq!(*used, format!("the usual places hold no capture: used `{file}`"));
+        let images = format!("no images are beside `{file}`: used others, such as `images/0.png`");
+        assert_eq!(others.iter().collect::<Vec<_>>(), [&images][..usize::from(file.starts_with("output"))].to_vec());
         assert!(is_described(path));
         // As a run keeps it.
         assert_eq!(read_file(&capture.folder, &path.join(file), true).unwrap().present().count(), 3);
@@ -226,18 +229,36 @@ fn captures_are_found_in_unusual_places() {
         std::fs::rename(path.join("images"), path.join(place).join("images")).unwrap();
         check(&folder, &format!("{place}/sparse/images.bin"), place);
     }
+    let distort = |model: &Path| {
+        let mut bytes = std::fs::read(model.join("cameras.bin")).unwrap();
+        // One camera of COLMAP's model OPENCV, which has four more parameters.
+        bytes[12] = 4;
+        bytes.extend([0.1, 0.0, 0.0, 0.0].map(f64::to_le_bytes).concat());
+        std::fs::write(model.join("cameras.bin"), bytes).unwrap();
+    };
     // A model with distortion, whose images are those beside its folder.
     for place in ["output/sparse/0", "output/colmap/sparse", "colmap/sparse/0/refined"] {
         let files = ["cameras.bin", "images.bin"].map(|name| [format!("sparse/0/{name}"), format!("{place}/{name}")]);
         let folder = moved(Format::Colmap, &files.each_ref().map(|[from, to]| (from.as_str(), to.as_str())));
-        let cameras = folder.path().join(place).join("cameras.bin");
-        let mut bytes = std::fs::read(&cameras).unwrap();
-        // One camera of COLMAP's model OPENCV, which has four more parameters.
-        bytes[12] = 4;
-        bytes.extend([0.1, 0.0, 0.0, 0.0].map(f64::to_le_bytes).concat());
-        std::fs::write(&cameras, bytes).unwrap();
+        distort(&folder.path().join(place));
         check(&folder, &format!("{place}/images.bin"), "");
     }
+    // 3D Gaussian Splatting's, whose images are in `input`.
+    let place = "colmap/distorted/sparse/0";
+    let files = ["cameras.bin", "images.bin"].map(|name| [format!("sparse/0/{name}"), format!("{place}/{name}")]);
+    let folder = moved(Format::Colmap, &files.each_ref().map(|[from, to]| (from.as_str(), to.as_str())));
+    distort(&folder.path().join(place));
+    let input = folder.path().join("input");
+    (0..3).for_each(|i| kit::picture(&input.join(format!("{i}.png")), 8, 6));
+    assert_eq!(read(folder.path(), None).unwrap().views[0].image, Some(input.join("0.png")));
+    // A fourth level counts if three hold nothing.
+    let folder = moved(Format::Transforms, &[("transforms.json", "a/b/c/d/transforms.json")]);
+    std::fs::rename(folder.path().join("images"), folder.path().join("a/b/c/d/images")).unwrap();
+    check(&folder, "a/b/c/d/transforms.json", "a/b/c/d");
+    let [far, near] = ["a/b/c/d", "a/b/c"].map(|place| folder.path().join(place));
+    (0..3).for_each(|i| kit::picture(&near.join(format!("images/{i}.png")), 8, 6));
+    std::fs::copy(far.join("transforms.json"), near.join("transforms.json")).unwrap();
+    check(&folder, "a/b/c/transforms.json", "a/b/c");
     for name in ["Transforms.json", "transform.json", "transforms.json.txt"] {
         check(&moved(Format::Transforms, &[("transforms.json", name)]), name, "");
     }

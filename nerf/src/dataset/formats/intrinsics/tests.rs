@@ -541,12 +541,20 @@ fn principal_points_far_outside_of_the_image_are_named() {
 
 #[test]
 fn principal_points_of_the_turned_image_are_named() {
-    let what = ["`cx`: and `cy` are 24 and 33, the middle of 48x64 pixels", "image of frames[0] has 64x48", "its own"];
+    let what = ["`cx`: gives the principal point 24, 33, the middle of 48x64 pixels", "but frames[0] has 64x48"];
     fails(|d| set(d, &json!({ "cx": 24, "cy": 33 })), &what);
-    fails(
-        |d| set(&mut d["frames"][1], &json!({ "cx": 24, "cy": 33 })),
-        &["`frames[1].cx`: ", "image of frames[1] has"],
-    );
+    fails(|d| set(d, &json!({ "cx": 24, "cy": 33 })), &["the frame's own `cx` and `cy`, or swap `w` and `h`"]);
+    let matrix = |d: &mut Value| {
+        ["fl_x", "fl_y", "cx", "cy"].into_iter().for_each(|name| drop(d.as_object_mut().unwrap().remove(name)));
+        set(d, &json!({ "K": [[9, 0, 24], [0, 9, 33], [0, 0, 1]] }));
+    };
+    fails(matrix, &["`K`: gives the principal point 24, 33"]);
+    // A frame's own crop.
+    let folder = tempfile::tempdir().unwrap();
+    let mut document = json!({ "fl_x": 9, "w": 8, "h": 6, "cx": 4, "cy": 3, "frames": frames(&["0.png", "1.png"]) });
+    set(&mut document["frames"][1], &json!({ "cx": 3, "cy": 4 }));
+    std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+    assert_eq!(transforms::read(folder.path()).unwrap().views[1].camera.centre, [3.0, 4.0]);
     // A crop may have its principal point there nearly, and middles of a square are close to each other.
     assert_eq!(with(json!({ "cx": 26, "cy": 32 })).centre, [26.0, 32.0]);
     assert_eq!(with(json!({ "w": 48, "h": 48, "cx": 24, "cy": 24 })).centre, [24.0, 24.0]);
@@ -557,5 +565,7 @@ fn principal_points_of_the_turned_image_are_named() {
     std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
     picture(&folder.path().join("0.png"), 8, 6);
     picture(&folder.path().join("1.png"), 6, 8);
-    says(&transforms::read(folder.path()).unwrap_err().to_string(), &["`cx`: ", "image of frames[1] has 6x8"]);
+    let message = transforms::read(folder.path()).unwrap_err().to_string();
+    says(&message, &["`cx`: ", "but frames[1] has 6x8"]);
+    assert!(message.ends_with("`cx` and `cy`"), "{message}");
 }

@@ -312,8 +312,8 @@ fn depth_images_of_8_bits_need_a_unit() {
     let folder = folder(|d| d["frames"][0]["depth_file_path"] = json!("depth/0.png"));
     let path = folder.path().join("depth/0.png");
     picture(&path, 8, 6);
-    let expected = "depth images have 8 bits, such as `depth/0.png`: in units of 0.001, no depth exceeds 0.255; give \
-                    the right unit as `depth_unit_scale_factor`";
+    let expected = "depth images have 8 bits, such as `depth/0.png`: in units of 0.001, no depth exceeds 0.255; check \
+                    `depth_unit_scale_factor`";
     assert_eq!(read(folder.path()).unwrap().assumptions, [expected]);
     let file = folder.path().join(FILE);
     let plain = std::fs::read_to_string(&file).unwrap();
