@@ -70,3 +70,18 @@ impl<T: Scalar, O: FusedGradient<T>> Op<T> for GradientOp<O> {
         self.op.recorded(self.input, x, g)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::GradientOp;
+    use crate::ops::vector::Normalize;
+    use crate::{Tape, Tensor};
+
+    #[test]
+    #[should_panic(expected = "the gradient must have the shape of the result")]
+    fn gradients_of_another_shape_are_refused() {
+        let tape = Tape::<f32>::new();
+        let [x, g] = [[2, 3], [3, 2]].map(|shape| tape.constant(Tensor::ones(&shape)));
+        let _ = tape.apply(GradientOp { op: Normalize, input: 0 }, &[&x, &g]);
+    }
+}

@@ -234,9 +234,9 @@ impl Running for Unbounded {
     }
 }
 
-/// Two numbers that differ by 1 at most and add up to `exponent`, the smaller one first.
+/// Two numbers that differ by 1 at most and add up to `exponent`.
 fn halves(exponent: i64) -> [i64; 2] {
-    [exponent >> 1, exponent - (exponent >> 1)]
+    [exponent / 2, exponent - exponent / 2]
 }
 
 /// `product * g * 2^exponent`, for a product that is near 1, 0 or not finite, rounded once more at most.
