@@ -224,6 +224,7 @@ impl<T: Scalar> Op<T> for CrossEntropy {
 
 /// The mean of `loss`. Where that is out of range, it is the mean of `scaled(up)`, which is `loss / up`, times `up`: a
 /// power of two of at least the number of elements.
+#[track_caller]
 fn mean_in_range<'t, T: Scalar>(loss: Var<'t, T>, scaled: impl FnOnce(f64) -> Var<'t, T>) -> Var<'t, T> {
     let mean = loss.mean();
     if mean.item().is_finite() {
@@ -307,6 +308,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     /// `smooth_l1 / up` for a `beta` above 0, with the division before the difference.
+    #[track_caller]
     fn scaled_huber(&self, target: &Self, beta: f64, up: f64) -> Self {
         // With m, the smaller of |r| and beta: m / beta (|r| - m / 2).
         let m = (self - target).abs().minimum(self.constant(beta));
