@@ -5,6 +5,7 @@ use crate::op::Kept;
 use crate::{Error, Op, ShapeError, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, checked_len};
 use smallvec::SmallVec;
+use std::any::Any;
 use std::cell::{Cell, RefCell};
 use std::fmt;
 use std::panic::{AssertUnwindSafe, Location, catch_unwind, resume_unwind};
@@ -82,10 +83,11 @@ impl<T: Scalar> Tape<T> {
         }
     }
 
-    /// An empty tape for a part of this one's work, with the same pool, [`check_finite`](Self::check_finite) setting
-    /// and line.
-    pub(crate) fn nested(&self) -> Self {
-        let tape = Tape::with_pool(self.pool.clone());
+    /// An empty tape for a part of this one's work, with the same [`check_finite`](Self::check_finite) setting and line,
+    /// and the same pool if it has the same type.
+    pub(crate) fn nested<U: Scalar>(&self) -> Tape<U> {
+        let pool = (&self.pool as &dyn Any).downcast_ref::<Pool<U>>();
+        let tape = Tape::with_pool(pool.cloned().unwrap_or_default());
         tape.check_finite.set(self.check_finite.get());
         tape.trying.set(self.trying.get());
         tape.differentiating.set(self.differentiating.get());

@@ -250,6 +250,49 @@ fn normalizes<T: Scalar>() {
     }
 }
 
+/// Fails if the derivative by a row of the gradient by the row is not finite although its largest `term` is in range.
+/// `g` and `h` are the gradients of the result and of the first gradient.
+#[track_caller]
+fn check_finite(what: &str, [x, g, h]: [&[f64]; 3], term: Exact, f: impl for<'t> Fn(&Var<'t, f32>) -> Var<'t, f32>) {
+    let limit = Exact::new(1.0).shifted(Format::of::<f32>().greatest - 4);
+    if term >= limit {
+        return;
+    }
+    let tape = Tape::<f32>::new();
+    let tensor = |x: &[f64]| Tensor::from_fn(&[x.len()], |i| x[i] as f32);
+    let var = tape.leaf(tensor(x));
+    let y = f(&var);
+    let first = y.vjp(&tape.constant(tensor(g)).reshape(y.shape()), &[&var]).remove(0);
+    let second = tape.no_grad(|| first.vjp(&tape.constant(tensor(h)), &[&var])).remove(0);
+    assert!(second.value().is_finite(), "{what} of {x:?}, g {g:?}, h {h:?}: {:?}", second.value());
+}
+
+/// Factors leave the range of f32: the third power of a length of 1e-20, or a product of both incoming gradients.
+#[test]
+fn second_derivatives_of_rows_of_all_bits_are_finite() {
+    for case in 0..2 * ROWS {
+        let random = &mut Random::of("second", case);
+        let n = 1 + random.below(7) as usize;
+        let (row, logits) = (row::<f32>(random, n), logits::<f32>(random, n));
+        let [g, h] = [(); 2].map(|()| factors::<f32>(random, n));
+        let x = exacts(&row);
+        let [g_size, h_size] = [&g, &h].map(|x| largest(exacts(x)));
+        let size = g_size * h_size * Exact::new(3.0 * n as f64);
+        let first = |term: Exact| largest([term, term * h_size]);
+        let length = sum(x.iter().map(|x| x.square())).sqrt();
+        if !length.is_zero() {
+            let term = largest([size / length.square(), first(g_size / length)]);
+            check_finite("normalize", [&row, &g, &h], term, |x| x.normalize());
+        }
+        let term = largest([size, first(g_size * Exact::new(n as f64))]);
+        check_finite("log_softmax", [&logits, &g, &h], term, |x| x.log_softmax(-1));
+        // The product of all elements but one or two is at most that of all that are larger than 1.
+        let product = x.iter().fold(Exact::new(1.0), |product, &x| product * largest([x, Exact::new(1.0)]));
+        let term = largest([size * product, first(g_size * product)]);
+        check_finite("prod", [&row, &g[..1], &h], term, |x| x.prod());
+    }
+}
+
 #[test]
 fn softmax_and_its_relatives_of_all_bits() {
     softmaxes::<f32>();
