@@ -1,5 +1,6 @@
 //! Cumulative sums and products, and the recurrence in their derivatives.
 
+use super::gradient_op::{FusedGradient, GradientOp, has_far};
 use super::product::Unbounded;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, simd};
@@ -246,16 +247,17 @@ impl Walk {
         are_right
     }
 
-    /// The gradient of [`products`](Self::products), in `dx`. Whether all are right, if it is `CHECKED`.
-    fn products_grad<const CHECKED: bool, S: Running, T: Scalar>(
+    /// The gradient by the factors of the [`Running`] numbers that begin with `start`, get the factors `x` and then the
+    /// summands `b`, if there are any; in `dx`. Whether all are right, if it is `CHECKED`.
+    fn factors_grad<const CHECKED: bool, S: Running, T: Scalar>(
         self,
         shape: &[usize],
-        x: &[T],
-        g: &[T],
+        [x, g]: [&[T]; 2],
+        (start, b): (f64, Option<&[T]>),
         dx: &mut [T],
     ) -> bool {
         let (mut later, mut are_right) = (vec![S::from(0.0); x.len()], true);
-        // The gradient of the product up to entry i, times the factor there.
+        // The gradient of the number at entry i, times the factor there.
         self.back().run(shape, S::from(0.0), |sum, i| {
             let (x, g) = (x[i].to_f64(), g[i].to_f64());
             later[i] = sum.plus(S::from(g));
@@ -264,12 +266,39 @@ impl Walk {
             *sum = later[i].times(x);
             are_right &= is_zero || sum.is_in_range();
         });
-        self.run(shape, S::from(1.0), |product, i| {
+        self.run(shape, S::from(start), |before, i| {
             let x = x[i].to_f64();
-            dx[i] = T::from_f64(product.product(later[i]).value());
-            let is_zero = !CHECKED || x == 0.0 || product.value() == 0.0;
-            *product = product.times(x);
-            are_right &= is_zero || product.is_in_range();
+            dx[i] = T::from_f64(before.product(later[i]).value());
+            let is_zero = !CHECKED || x == 0.0 || before.value() == 0.0;
+            *before = before.times(x);
+            are_right &= is_zero || before.is_in_range();
+            if let Some(b) = b {
+                let b = b[i].to_f64();
+                let is_zero = !CHECKED || b == 0.0;
+                *before = before.plus(S::from(b));
+                are_right &= is_zero || before.is_in_range();
+            }
+        });
+        are_right
+    }
+
+    /// The [`Recurrence`] of the factors `a` and the summands `b`, in `y`. Whether all are right, if it is `CHECKED`.
+    fn recurrence<const CHECKED: bool, S: Running, T: Scalar>(
+        self,
+        shape: &[usize],
+        [a, b]: [&[T]; 2],
+        y: &mut [T],
+    ) -> bool {
+        let mut are_right = true;
+        self.run(shape, S::from(0.0), |state, i| {
+            let (a, b) = (a[i].to_f64(), b[i].to_f64());
+            let is_zero = !CHECKED || a == 0.0 || state.value() == 0.0;
+            *state = state.times(a);
+            are_right &= is_zero || state.is_in_range();
+            let is_zero = !CHECKED || b == 0.0;
+            *state = state.plus(S::from(b));
+            are_right &= is_zero || state.is_in_range();
+            y[i] = T::from_f64(state.value());
         });
         are_right
     }
@@ -337,10 +366,11 @@ impl<T: Scalar> Op<T> for CumprodGrad {
         let mut out = pool.tensor(x[0].shape());
         let (x, g, dx, shape) = (x[0].as_slice(), x[1].as_slice(), out.as_mut_slice(), x[0].shape());
         // Gradients in f64 may bring back products that have fallen out of its range; those in f32 may not.
+        let products = (1.0, None);
         if T::EPSILON > 1e-10 && self.0.stays_in_range(shape, x) {
-            self.0.products_grad::<false, f64, T>(shape, x, g, dx);
-        } else if !self.0.products_grad::<true, f64, T>(shape, x, g, dx) {
-            self.0.products_grad::<false, Unbounded, T>(shape, x, g, dx);
+            self.0.factors_grad::<false, f64, T>(shape, [x, g], products, dx);
+        } else if !self.0.factors_grad::<true, f64, T>(shape, [x, g], products, dx) {
+            self.0.factors_grad::<false, Unbounded, T>(shape, [x, g], products, dx);
         }
         out
     }
@@ -361,7 +391,7 @@ impl<T: Scalar> Op<T> for CumprodGrad {
 }
 
 /// y[i] = a[i] y[i - 1] + b[i], with 0 before the first entry. db: the same recurrence of g in the other direction,
-/// with the next factor; da = db y[i - 1].
+/// with the next factor; da = db y[i - 1]. Numbers are in f64, or in [`Unbounded`] numbers if they leave its range.
 #[derive(Clone, Copy)]
 pub struct Recurrence(
     /// The order.
@@ -383,22 +413,55 @@ impl<T: Scalar> Op<T> for Recurrence {
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let mut out = pool.tensor(x[0].shape());
         let (a, b, y, shape) = (x[0].as_slice(), x[1].as_slice(), out.as_mut_slice(), x[0].shape());
-        self.0.run(shape, 0.0, |state, i| {
-            *state = a[i].to_f64() * *state + b[i].to_f64();
-            y[i] = T::from_f64(*state);
-        });
+        if T::EPSILON > 1e-10 && self.0.stays_in_range(shape, a) {
+            self.0.recurrence::<false, f64, T>(shape, [a, b], y);
+        } else if !self.0.recurrence::<true, f64, T>(shape, [a, b], y) {
+            self.0.recurrence::<false, Unbounded, T>(shape, [a, b], y);
+        }
         out
     }
 
-    fn reads(&self) -> Reads {
-        Reads::only(&[0]).and_output()
+    fn reads_for(&self, has_gradient: &dyn Fn(usize) -> bool) -> Reads {
+        // The summands are for products that may be lost.
+        Reads::only(&[0]).and_if(has_gradient(0), Reads::ALL)
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let next = self.0.neighbour(&cx.x(0), true, 0.0);
-        let db = cx.tape().apply(Recurrence(self.0.back()), &[&next, cx.g()]);
-        let da = cx.needs(0).then(|| &db * self.0.neighbour(&cx.y(), false, 0.0));
+        let (tape, a, g) = (cx.tape(), cx.x(0), cx.g());
+        let db = tape.apply(Recurrence(self.0.back()), &[&self.0.neighbour(&a, true, 0.0), g]);
+        let da = cx.needs(0).then(|| {
+            // A factor of the product may have been rounded out of the range.
+            if has_far(db.value()) || has_far(cx.y().value()) {
+                tape.apply(GradientOp { op: *self, input: 0 }, &[&a, &cx.x(1), g])
+            } else {
+                &db * self.0.neighbour(&cx.y(), false, 0.0)
+            }
+        });
         Grads::new([da, Some(db)])
+    }
+}
+
+impl<T: Scalar> FusedGradient<T> for Recurrence {
+    const GRADIENT: &'static str = "recurrence_grad";
+
+    /// The gradient by the factors, from numbers that are not rounded to the type: one may be out of its range where
+    /// the product is not.
+    fn gradient(&self, _input: usize, x: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(x[0].shape());
+        let (a, b, da, shape) = (x[0].as_slice(), x[1].as_slice(), out.as_mut_slice(), x[0].shape());
+        let (given, sums) = ([a, g.as_slice()], (0.0, Some(b)));
+        if T::EPSILON > 1e-10 && self.0.stays_in_range(shape, a) {
+            self.0.factors_grad::<false, f64, T>(shape, given, sums, da);
+        } else if !self.0.factors_grad::<true, f64, T>(shape, given, sums, da) {
+            self.0.factors_grad::<false, Unbounded, T>(shape, given, sums, da);
+        }
+        out
+    }
+
+    fn recorded<'t>(&self, _input: usize, x: &[Var<'t, T>], g: &Var<'t, T>) -> Option<Var<'t, T>> {
+        let (walk, tape) = (self.0, g.tape());
+        let later = tape.apply(Recurrence(walk.back()), &[&walk.neighbour(&x[0], true, 0.0), g]);
+        Some(later * walk.neighbour(&tape.apply(*self, &[&x[0], &x[1]]), false, 0.0))
     }
 }
 

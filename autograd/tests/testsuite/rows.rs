@@ -250,6 +250,50 @@ fn normalizes<T: Scalar>() {
     }
 }
 
+/// `y[i] = a[i] y[i - 1] + b[i]` in one direction, and the same of magnitudes.
+fn recurrence(a: &[f64], b: &[f64]) -> Vec<[Exact; 2]> {
+    let (a, b) = (exacts(a), exacts(b));
+    let mut state = [Exact::ZERO; 2];
+    let step = |(&a, &b): (&Exact, &Exact)| {
+        state = [a * state[0] + b, a.abs() * state[1] + b.abs()];
+        state
+    };
+    a.iter().zip(&b).map(step).collect()
+}
+
+fn recurrences<T: Scalar>() {
+    for case in 0..2 * ROWS {
+        let random = &mut Random::of("recurrence", case);
+        let n = 1 + random.below(7) as usize;
+        let (a, b, g) = (row::<T>(random, n), row::<T>(random, n), factors::<T>(random, n));
+        let exact = recurrence(&a, &b);
+        let back = |x: &[f64]| x.iter().rev().copied().collect::<Vec<_>>();
+        let next: Vec<f64> = a[1..].iter().copied().chain([0.0]).collect();
+        let mut later = recurrence(&back(&next), &back(&g));
+        later.reverse();
+        let limit = Exact::new(1.0).shifted(Format::of::<T>().greatest);
+        if exact.iter().any(|[_, term]| *term >= limit) {
+            continue;
+        }
+        let what = |what: &str| format!("{what}, summands {b:?}, g {g:?}");
+        let [y, plain, recorded] = evaluate::<T>(&[&a, &b], &g, |x| x[0].recurrence(&x[1], 0));
+        check::<T>(&what("recurrence"), &a, &y[0], &exact, 8.0);
+        let before = [[Exact::ZERO; 2]].into_iter().chain(exact);
+        let of_factors: Vec<_> = before.zip(&later).map(|(y, later)| [y[0] * later[0], y[1] * later[1]]).collect();
+        for (which, grads) in [("gradient", plain), ("recorded gradient", recorded)] {
+            check::<T>(&what(&format!("{which} of recurrence by factors")), &a, &grads[0], &of_factors, 8.0);
+            check::<T>(&what(&format!("{which} of recurrence by summands")), &a, &grads[1], &later, 8.0);
+        }
+    }
+}
+
+/// The gradient by a factor is a product of two sums, of which one may be out of the range.
+#[test]
+fn recurrence_of_all_bits() {
+    recurrences::<f32>();
+    recurrences::<f64>();
+}
+
 /// Fails if the derivative by a row of the gradient by the row is not finite although its largest `term` is in range.
 /// `g` and `h` are the gradients of the result and of the first gradient.
 #[track_caller]
