@@ -1,5 +1,6 @@
 //! Elementwise operations from one formula: one pass for the value, one more for all gradients.
 
+use crate::ops::gradient_op::{FusedGradient, GradientOp, has_far};
 use crate::reading::Reading;
 use crate::recorded::{Recorded, Sheet};
 use crate::{Cases, Dual, Grads, Op, Reads, ShapeError, Var, Vjp};
@@ -193,20 +194,66 @@ impl<T: Scalar, F: Formula<N>, const N: usize> Op<T> for Elementwise<F, N> {
 
     #[inline(never)]
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let readings = self.readings();
         if cx.recording() {
+            let reads = Op::<T>::reads_for(self, &|i| cx.needs(i));
+            let has_operands = !reads.output() || (0..N).all(|i| reads.input(i));
+            let is_fusible = has_operands && N < 3 && readings.iter().all(|reading| reading.of != 0);
+            let has_far_operand = || (0..N).any(|i| reads.input(i) && has_far(cx.x(i).value()));
+            if is_fusible && (has_far(cx.g().value()) || has_far_operand()) {
+                return fused_gradients(cx, *self, reads);
+            }
             let sheet = Sheet::new();
-            let (g, x, y) = given(cx, &sheet, Op::<T>::reads_for(self, &|i| cx.needs(i)));
+            let (g, x, y) = given(cx, &sheet, reads);
             return recorded(cx, &sheet, &self.0.vjp(g, x, y));
         }
         let mut wanted = [false; N];
         let mut reads = 0;
-        let readings = self.readings();
         for (i, reading) in readings.iter().enumerate() {
             wanted[i] = cx.needs(i) && !reading.is_gradient;
             reads |= if wanted[i] { reading.of } else { 0 };
         }
         Grads::new(gradients(cx, &readings, wanted, reads, &|x, out| self.gradients(x, out)))
     }
+}
+
+impl<T: Scalar, F: Formula<N>, const N: usize> FusedGradient<T> for Elementwise<F, N> {
+    const GRADIENT: &'static str = F::NAME;
+    // Recorded only where a number is far from 1.
+    const WIDENS: bool = true;
+
+    fn gradient(&self, input: usize, x: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        let y = (self.readings()[input].of & Reading::OUTPUT != 0).then(|| self.forward(x, pool));
+        let all: SmallVec<[&Tensor<T>; 6]> =
+            [g, y.as_ref().unwrap_or(g)].into_iter().chain(x.iter().copied()).collect();
+        let grads = map_fused(&all, from_fn::<_, N, _>(|i| i == input), pool, &|x, out| self.gradients(x, out));
+        match grads.into_iter().flatten().next() {
+            Some(grad) => sum_to(&grad, x[input].shape(), pool),
+            None => unreachable!("an operand of the formula"),
+        }
+    }
+
+    fn recorded<'t>(&self, input: usize, x: &[Var<'t, T>], g: &Var<'t, T>) -> Option<Var<'t, T>> {
+        let (sheet, has_y) = (Sheet::new(), self.readings()[input].of & Reading::OUTPUT != 0);
+        let y = if has_y { self.0.on(from_fn(|i| &x[i])) } else { g.clone() };
+        let grads = self.0.vjp(sheet.given(g.clone()), from_fn(|i| sheet.given(x[i].clone())), sheet.given(y));
+        let grad = sheet.vars(g, &[grads[input]]).remove(0);
+        Some(grad.broadcast_to(g.shape()).sum_to(x[input].shape()))
+    }
+}
+
+/// The required gradients of a recorded pass in which a number is far from 1, each as one operation. It reads the
+/// operands, and computes the result again if it needs it. Numbers stand for operands that no required gradient reads.
+fn fused_gradients<'t, T: Scalar, F: Formula<N>, const N: usize>(
+    cx: &Vjp<'t, '_, T>,
+    op: Elementwise<F, N>,
+    reads: Reads,
+) -> Grads<'t, T> {
+    let unread = |i: usize| cx.constant(Tensor::scalar(T::ONE).broadcast_to(cx.shape(i)));
+    let x: [_; N] = from_fn(|i| if reads.input(i) { cx.x(i) } else { unread(i) });
+    let all: SmallVec<[&Var<'t, T>; 4]> = x.iter().chain([cx.g()]).collect();
+    let by = |input: usize| cx.needs(input).then(|| cx.tape().apply(GradientOp { op, input }, &all));
+    Grads::new((0..N).map(by))
 }
 
 /// Gradient, operands and result of a recorded pass. Those that the derivative does not read have no value.

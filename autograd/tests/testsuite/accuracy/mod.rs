@@ -8,6 +8,7 @@
 
 pub mod exact;
 mod operations;
+mod second;
 mod singles;
 
 use exact::{Exact, scaled};

@@ -61,8 +61,16 @@ pub fn acos(x: Exact) -> Exact {
 }
 
 /// The density of the standard normal distribution.
-fn density(x: Exact) -> Exact {
+pub fn density(x: Exact) -> Exact {
     (-x.square().shifted(-1)).exp() / Exact::PI.shifted(1).sqrt()
+}
+
+/// The argument of the sigmoid in `gelu_tanh`, and its derivatives.
+pub fn tanh_argument(x: Exact) -> [Exact; 3] {
+    let scale = (Exact::new(2.0) / Exact::PI).sqrt().shifted(1);
+    let cubic = Exact::new(44715.0) / Exact::new(1e6) * scale;
+    let three = Exact::new(3.0);
+    [scale * x + cubic * power(x, 3), scale + three * cubic * x.square(), (three * cubic * x).shifted(1)]
 }
 
 /// `x / (a^2 + b^2)`.
@@ -71,7 +79,7 @@ fn over_length(x: Exact, a: Exact, b: Exact) -> Exact {
 }
 
 /// A whole power.
-fn power(x: Exact, n: i32) -> Exact {
+pub fn power(x: Exact, n: i32) -> Exact {
     let product = (0..n.abs()).fold(one(), |product, _| product * x);
     if n < 0 { product.recip() } else { product }
 }
@@ -81,7 +89,7 @@ fn is_odd(x: f64) -> bool {
 }
 
 /// `a^b`; NaN for a negative base and a fractional exponent.
-fn real_power(a: f64, b: f64) -> Exact {
+pub fn real_power(a: f64, b: f64) -> Exact {
     let size = Exact::new(a.abs()).pow(Exact::new(b));
     if a < 0.0 && b % 1.0 != 0.0 {
         Exact::new(NAN)
@@ -229,12 +237,8 @@ fn activations<T: Scalar>() -> Vec<Operation<T>> {
         };
         "gelu": |v| v[0].gelu(), |x| gated(Exact::new(x), Exact::new(x).normal_cdf(), density(Exact::new(x)));
         "gelu_tanh": |v| v[0].gelu_tanh(), |x| {
-            let x = Exact::new(x);
-            let scale = (Exact::new(2.0) / Exact::PI).sqrt().shifted(1);
-            let cubic = Exact::new(44715.0) / Exact::new(1e6);
-            let u = scale * (x + cubic * power(x, 3));
-            let slope = scale * (one() + Exact::new(3.0) * cubic * x.square());
-            gated(x, u.sigmoid(), slope * u.sigmoid() * (-u).sigmoid())
+            let [u, slope, _] = tanh_argument(Exact::new(x));
+            gated(Exact::new(x), u.sigmoid(), slope * u.sigmoid() * (-u).sigmoid())
         };
     }
 }
