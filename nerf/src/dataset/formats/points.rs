@@ -46,12 +46,19 @@ impl Points {
         self.reason = Some(reason);
     }
 
+    /// Leaves out what follows the last of the announced points. This reason joins another.
+    pub(super) fn follow(&mut self, reason: String) {
+        let first = self.reason.take().map_or(String::new(), |first| format!("{first}; "));
+        self.reason = Some(first + &reason);
+    }
+
     /// Gives the points to a capture, with an assumption if some were left out.
     pub(super) fn attach(self, capture: &mut Capture, file: &Path) {
         let Points { points, total, reason } = self;
         if let Some(reason) = reason {
             let count = match points.len() as u64 {
                 0 => "the points".to_owned(),
+                count if count == total => "the rest".to_owned(),
                 count => format!("{} of {total} points", total - count),
             };
             let name = file.strip_prefix(&capture.folder).unwrap_or(file).display();

@@ -45,7 +45,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Checks that nothing follows the entries. Of entries in another layout, the last would end elsewhere.
-    fn end(&self, list: &str, count: usize) -> Result<()> {
+    fn end(&self, list: &str, count: u64) -> Result<()> {
         match self.rest.len() {
             0 => Ok(()),
             bytes => {
@@ -134,7 +134,7 @@ pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
         };
         cameras.push(CameraEntry { place, id, camera });
     }
-    cursor.end("cameras", count)?;
+    cursor.end("cameras", count as u64)?;
     Ok(cameras)
 }
 
@@ -151,7 +151,7 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
         cursor.skip_list(place, "points2D", OBSERVATION)?;
         images.push(ImageEntry::new(file, place, id, q, t, camera, &name)?);
     }
-    cursor.end("images", count)?;
+    cursor.end("images", count as u64)?;
     Ok(images)
 }
 
@@ -167,9 +167,12 @@ pub(super) fn points(file: &Path, bytes: &[u8]) -> Points {
             Ok(point) => _ = points.push(point, || place.name()),
             Err(error) => {
                 points.end(reason(error));
-                break;
+                return points;
             }
         }
+    }
+    if let Err(error) = cursor.end("points3D", points.total) {
+        points.follow(reason(error));
     }
     points
 }

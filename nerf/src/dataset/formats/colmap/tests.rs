@@ -303,6 +303,18 @@ fn damaged_points_are_left_out() {
     }
     let (found, said) = read(Encoding::Binary, &with(&points, 51, &[200]));
     assert!(found.is_empty() && said[0].contains("`points3D[0].track`: announces 200 entries"), "{said:?}");
+    // The second point has 51 bytes.
+    let [one, none] = [1_u64, 0].map(|count| with(&points, 0, &count.to_le_bytes()));
+    let said = |bytes: &[u8]| read(Encoding::Binary, bytes).1;
+    let file = "`sparse/0/points3D.bin`";
+    let more = "`points3D`: 51 bytes follow the last of 1 entries: copy the file again, or convert it with COLMAP's \
+                `model_converter`";
+    assert_eq!(read(Encoding::Binary, &one), (vec![2.0], vec![format!("left out the rest of {file}: {more}")]));
+    let both = format!("left out the points of {file}: points3D[0] has no finite position; {more}");
+    assert_eq!(said(&with(&one, 16, &nan)), [both]);
+    let all = format!("left out the points of {file}: `points3D`: 118 bytes follow the last of 0 entries");
+    assert!(said(&none)[0].starts_with(&all), "{:?}", said(&none));
+    assert_eq!(said(&points), [""; 0]);
     // The error of a point is not known.
     assert_eq!(read(Encoding::Binary, &with(&points, 43, &nan)), (vec![2.0, 5.0], vec![]));
 }
