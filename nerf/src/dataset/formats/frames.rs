@@ -106,7 +106,9 @@ impl Frames {
         let (mut rounded, mut blunt, mut shared) = (vec![], vec![], vec![]);
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
             check_known(frame)?;
-            let pose = matrix::pose(frame, "transform_matrix")?.and_then(|pose| check_lengths(frame).map(|()| pose));
+            let angle_y = dialect == Dialect::Transforms;
+            let pose = matrix::pose(frame, "transform_matrix")?;
+            let pose = pose.and_then(|pose| check_lengths(frame, angle_y).map(|()| pose));
             let mut pose = match pose {
                 Ok(pose) => pose,
                 Err(error) => {
@@ -132,7 +134,6 @@ impl Frames {
                     (None, None) => Ok([0, 0]),
                 }
             };
-            let angle_y = dialect == Dialect::Transforms;
             let camera = layers[i].camera(pose, header, angle_y)?;
             if contradicting.is_none() {
                 contradicting = layers[i].contradiction(&camera, angle_y);

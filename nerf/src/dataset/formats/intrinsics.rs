@@ -3,6 +3,7 @@
 use super::json::{Object, number, shown, truth};
 use super::layers::Layers;
 use super::lens;
+use super::limits::{unfit_centre, unfit_focal};
 use super::matrix::entries;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -48,8 +49,7 @@ const SHORTEST: f64 = 0.05;
 /// The largest difference of two values of a length, in pixels.
 const SAME: f64 = 0.01;
 
-/// Ranges of a camera's lengths in pixels.
-const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e9;
+/// Limits of a camera's lengths in pixels.
 const CENTRE: f64 = 1e9;
 const SIDE: f64 = 1048576.0;
 
@@ -100,20 +100,47 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     Err(object.error(name, format!("is {}, which raygrad does not read: {what}", shown(value))))
 }
 
-/// Checks that a frame's own lengths are finite, and its focal lengths above 0. Those of images without a pose are not,
-/// in some files.
+/// Checks that a frame's own principal point is finite, and its focal lengths or fields of view above 0. Those of images
+/// without a pose are not, in some files.
 ///
 /// # Errors
 /// If one is not.
-pub(super) fn check_lengths(frame: &Object<'_>) -> Result<()> {
-    for name in ["fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"] {
-        match frame.get(name).and_then(number) {
-            Some(x) if !x.is_finite() => _ = frame.number(name)?,
-            Some(_) if name.starts_with("fl") => _ = frame.positive(name)?,
-            _ => {}
+pub(super) fn check_lengths(frame: &Object<'_>, angle_y: bool) -> Result<()> {
+    for name in ["cx", "cy"] {
+        if frame.get(name).and_then(number).is_some_and(|x| !x.is_finite()) {
+            frame.number(name)?;
+        }
+    }
+    let vertical = ["fl_y", "fy", if angle_y { "camera_angle_y" } else { "fl_y" }];
+    for names in [["fl_x", "fx", "camera_angle_x"], vertical] {
+        // Only the first counts.
+        let Some(name) = names.into_iter().find(|name| frame.get(name).is_some()) else { continue };
+        if frame.get(name).and_then(number).is_some() {
+            frame.positive(name)?;
+        }
+    }
+    let matrices = MATRICES.into_iter().filter_map(|name| Some((name, frame.get(name)?)));
+    for (name, value) in matrices {
+        if let Some(what) = entries_of(value).and_then(|entries| unusable(&entries)) {
+            return Err(frame.error(name, format!("{what}, is {}", shown(value))));
         }
     }
     Ok(())
+}
+
+/// What is wrong with an [intrinsic matrix](MATRICES) that some programs write for images without a camera.
+fn unusable(entries: &[&Value]) -> Option<&'static str> {
+    let second = match entries.len() {
+        4 => 1,
+        9 => 4,
+        _ => 5,
+    };
+    let is_lost = |value: &&Value| value.is_null() || number(value).is_some_and(|x| !x.is_finite());
+    if entries.iter().any(is_lost) {
+        return Some("must have finite numbers");
+    }
+    let is_no_length = |i: usize| number(entries[i]).is_some_and(|f| f <= 0.0);
+    [0, second].into_iter().any(is_no_length).then_some("must have focal lengths above 0")
 }
 
 impl Layers<'_, '_> {
@@ -156,10 +183,8 @@ impl Layers<'_, '_> {
             return Ok(Camera { width, height, focal, centre: middle, lens, pose });
         }
         let given = self.centre()?;
-        for (i, side) in [width, height].map(|side| side as f64).into_iter().enumerate() {
-            // Crops may lie beside the principal point, but not far from it.
-            if let Some(x) = given[i].filter(|x| side > 0.0 && !(-side..=2.0 * side).contains(x)) {
-                let what = format!("is {x}, far outside of an image {side} wide or high: scale it with the image");
+        for (i, side) in [width, height].into_iter().enumerate().filter(|(_, side)| *side > 0) {
+            if let Some(what) = given[i].and_then(|x| unfit_centre(x, side)) {
                 return Err(self.error(["cx", "cy"][i], what));
             }
         }
@@ -300,18 +325,16 @@ fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Opt
                 let what = format!("is {a}, but `{other}` has a focal length of {f} pixels: remove the wrong one");
                 return Err(object.error(angle, what));
             }
-            if !FOCAL.contains(&f) {
-                return Err(object.error(length, format!("must be a focal length in pixels, 1e-3 to 1e9, is {f}")));
-            }
-            return Ok(Some(f));
+            return unfit_focal(f).map_or(Ok(Some(f)), |what| Err(object.error(length, what)));
         }
         if angle == "camera_angle_y" && !angle_y {
             return Ok(None);
         }
         let Some(a) = object.number(angle)? else { return Ok(None) };
         let f = focal_length(side, a);
-        if !(a > 0.0 && a < PI) || (side > 0 && !FOCAL.contains(&f)) {
-            return Err(object.error(angle, format!("must be an angle in radians between 0 and pi, is {a}")));
+        if !(a > 0.0 && a < PI) || (side > 0 && unfit_focal(f).is_some()) {
+            let advice = if a > PI { ": multiply degrees by pi / 180" } else { "" };
+            return Err(object.error(angle, format!("must be an angle in radians between 0 and pi, is {a}{advice}")));
         }
         Ok(Some(f))
     };
@@ -354,15 +377,16 @@ impl OtherNames {
             let Some((value, entries)) = object.get(name).and_then(|value| Some((value, entries_of(value)?))) else {
                 continue;
             };
-            let m: Option<Vec<f64>> = entries.into_iter().map(|x| number(x).filter(|x| x.is_finite())).collect();
-            let lengths = m.ok_or("must have finite numbers").and_then(|m| lengths(&m, value.is_object()));
+            let m: Option<Vec<f64>> = entries.iter().map(|x| number(x)).collect();
+            let m = unusable(&entries).map_or_else(|| m.ok_or("must have finite numbers"), Err);
+            let lengths = m.and_then(|m| lengths(&m, value.is_object()));
             let lengths = lengths.map_err(|what| object.error(name, format!("{what}, is {}", shown(value))))?;
             return Ok(OtherNames { name, lengths: lengths.map(Some) });
         }
         if ["fl_x", "fl_y"].iter().any(|name| object.get(name).is_some()) {
             return Ok(OtherNames::default());
         }
-        let [fx, fy] = [object.number("fx")?, object.number("fy")?];
+        let [fx, fy] = [object.positive("fx")?, object.positive("fy")?];
         Ok(OtherNames { name: if fx.is_some() { "fx" } else { "fy" }, lengths: [fx, fy, None, None] })
     }
 }

@@ -1,7 +1,25 @@
 //! Limits for the contents of a capture's files.
 
+use std::ops::RangeInclusive;
+
 /// The most pixels of an image side; more means that the file is damaged.
 pub(super) const MOST_PIXELS: usize = 1 << 24;
+
+/// Focal lengths in pixels; others mean that the file is damaged.
+const FOCAL: RangeInclusive<f64> = 1e-3..=1e9;
+
+/// What is wrong with a focal length in pixels.
+pub(super) fn unfit_focal(focal: f64) -> Option<String> {
+    let is_fit = FOCAL.contains(&focal);
+    (!is_fit).then(|| format!("must be a focal length in pixels, 1e-3 to 1e9, is {focal}"))
+}
+
+/// What is wrong with a coordinate of the principal point of an image with this side. Crops may lie beside the point, but
+/// not far from it.
+pub(super) fn unfit_centre(x: f64, side: usize) -> Option<String> {
+    let is_fit = (-(side as f64)..=2.0 * side as f64).contains(&x);
+    (!is_fit).then(|| format!("is {x}, far outside of an image {side} wide or high: scale it with the image"))
+}
 
 /// The start of a word from a file, short enough for a one-line message.
 pub(super) fn start(word: &str) -> String {

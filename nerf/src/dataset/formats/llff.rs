@@ -4,7 +4,7 @@
 //! and focal length in pixels. The last two are the nearest and farthest depth. Rows belong to the images of a
 //! folder, usually `images`, in the order of their names, or to those of them that `view_imgs.txt` lists.
 
-use super::limits::{MOST_PIXELS, start};
+use super::limits::{MOST_PIXELS, start, unfit_focal};
 use super::locate::{IMAGES, folders, stem};
 use super::npy::Matrix;
 use super::paths::extension;
@@ -181,8 +181,8 @@ fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, Option<[f64; 2]>
         _ => Err(format!("{name} must be 1 to {MOST_PIXELS} pixels, is {value}")),
     };
     let (width, height) = (pixels("width", width)?, pixels("height", height)?);
-    if focal <= 0.0 {
-        return Err(format!("focal length must be more than 0, is {focal}"));
+    if let Some(what) = unfit_focal(focal) {
+        return Err(format!("column 14 {what}"));
     }
     let bounds = Some([row[15], row[16]]).filter(|[near, far]| *near > 0.0 && far > near && *far <= MOST_RATIO * near);
     let centre = [0.5 * width as f64, 0.5 * height as f64];

@@ -97,8 +97,8 @@ fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
     }
     if m.determinant() < 0.0 && is_orthonormal(&m, ROUNDED) {
         return Err(
-            "the upper left 3x3 mirrors (its determinant is -1): its world or its camera has left-handed axes, \
-            as in Unity and Unreal; export right-handed axes"
+            "the upper left 3x3 mirrors (its determinant is -1): if all frames do, their world or camera has left-handed \
+             axes, as in Unity and Unreal, so export right-handed axes; otherwise remove or correct this frame"
                 .to_owned(),
         );
     }

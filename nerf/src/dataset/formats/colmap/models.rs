@@ -3,7 +3,7 @@
 use super::super::models::{MODELS, Model, coefficient, least};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
-use crate::dataset::formats::limits::{MOST_PIXELS, start};
+use crate::dataset::formats::limits::{MOST_PIXELS, start, unfit_centre, unfit_focal};
 use glam::DAffine3;
 use std::f64::consts::PI;
 
@@ -64,8 +64,8 @@ pub(super) fn camera(
         return Ok(Camera { width, height, focal, centre, lens: Lens::Equirectangular, pose: DAffine3::IDENTITY });
     }
     let focal = ["fx", "fy"].map(|name| or_zero(if model.single { "f" } else { name }));
-    if let Some(focal) = focal.iter().find(|focal| !(**focal > 0.0)) {
-        return Err(("focal length", format!("must be more than 0, is {focal}")));
+    if let Some(what) = focal.into_iter().find_map(unfit_focal) {
+        return Err(("focal length", what));
     }
     let lens = match model.lens(or_zero) {
         Lens::Fov { omega } if omega.abs() >= PI => {
@@ -76,6 +76,11 @@ pub(super) fn camera(
         lens => lens,
     };
     let centre = ["cx", "cy"].map(or_zero);
+    for (name, x, side) in [("cx", centre[0], width), ("cy", centre[1], height)] {
+        if let Some(what) = unfit_centre(x, side) {
+            return Err((name, what));
+        }
+    }
     Ok(Camera { width, height, focal, centre, lens: simplest(lens), pose: DAffine3::IDENTITY })
 }
 

@@ -238,7 +238,7 @@ fn text_errors_name_the_line() {
         (0, "100 80", "0 80", "`line 4`", "width: must be 1 to"),
         (0, "100 80", "100 99999999999", "`line 4`", "height: must be 1 to"),
         (0, "100 80", "100.5 80", "`line 4`", "WIDTH: must be an integer of 64 bits, is `100.5`"),
-        (0, " 90 ", " -90 ", "`line 4`", "focal length: must be more than 0, is -90"),
+        (0, " 90 ", " -90 ", "`line 4`", "focal length: must be a focal length in pixels, 1e-3 to 1e9, is -90"),
         (0, "9 SIMPLE", "-9 SIMPLE", "`line 4`", "CAMERA_ID: must be an integer of 32 bits"),
         (1, "0.5 0.5 0.5 0.5", "0 0 0 0", "`line 3`", "qvec: is a quaternion of length 0"),
         (1, "0.5 0.5 0.5 0.5", "inf 0 0 0", "`line 3`", "qvec: must be a finite number, is inf"),
@@ -342,7 +342,7 @@ fn binary_errors_name_the_entry() {
     fails(Binary, 0, &with(&cameras, second + 8, &[0]), "`cameras[1].width`", "must be 1 to");
     fails(Binary, 0, &with(&cameras, second + 16, &[255; 8]), "`cameras[1].height`", "must be 1 to");
     fails(Binary, 0, &with(&cameras, second + 48, &f64::NAN.to_le_bytes()), "`cameras[1].k1`", "finite number, is NaN");
-    fails(Binary, 0, &with(&cameras, second + 24, &[0; 8]), "`cameras[1].focal length`", "must be more than 0, is 0");
+    fails(Binary, 0, &with(&cameras, second + 24, &[0; 8]), "`cameras[1].focal length`", "1e-3 to 1e9, is 0");
     fails(Binary, 0, &cameras[..cameras.len() - 1], "`cameras[1].k1`", "the file ends here");
     fails(Binary, 0, &cameras[..5], "`cameras`", "the file ends before their number");
     // Counts that no memory could hold, and one that is just beyond the end.
@@ -425,6 +425,9 @@ fn single_invalid_cameras_are_left_out() {
     for (camera, image, expected) in [
         ("3 PINHOLE 8 6 nan 9 4 3", "", "fx: must be a finite number, is NaN"),
         ("3 PINHOLE 0 6 9 9 4 3", "", "width: must be 1 to"),
+        ("3 PINHOLE 8 6 9 1e300 4 3", "", "focal length: must be a focal length in pixels, 1e-3 to 1e9, is 1"),
+        ("3 PINHOLE 8 6 9 9 4 -6.5", "", "cy: is -6.5, far outside of an image 6 wide or high: scale it"),
+        ("3 SIMPLE_RADIAL 8 6 9 16.5 3 0", "", "cx: is 16.5, far outside of an image 8 wide or high: scale it"),
         ("3 EUCM 8 6 9 9 4 3 1 1", "", "EUCM is not supported"),
         ("3 EQUIRECTANGULAR 8 6 8 7", "", "must be those of the image, 8 and 6, are 8 and 7"),
         ("", "3 0 0 0 0 0 0 4 3 3.png\n", "qvec: is a quaternion of length 0"),
@@ -479,6 +482,7 @@ fn spherical_and_plain_fisheye_models_are_read() {
     let fisheye = with("0 SIMPLE_FISHEYE 8 6 9 4 3");
     assert_eq!((fisheye.lens, fisheye.focal, fisheye.centre), (lens, [9.0; 2], [4.0, 3.0]));
     assert_eq!(with("0 FISHEYE 8 6 9 10 4 3").focal, [9.0, 10.0]);
+    assert_eq!(with("0 PINHOLE 8 6 9 10 16 -6").centre, [16.0, -6.0], "a crop beside the principal point");
 }
 
 #[test]

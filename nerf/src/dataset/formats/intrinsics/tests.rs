@@ -390,6 +390,13 @@ fn invalid_camera_numbers_are_named() {
         };
         fails(change, &["`camera_angle_x`: must be an angle in radians between 0 and pi"]);
     }
+    fails(
+        |d| {
+            remove(d, "fl_x");
+            d["camera_angle_x"] = json!(39.6);
+        },
+        &["`camera_angle_x`: must be an angle in radians between 0 and pi, is 39.6: multiply degrees by pi / 180"],
+    );
     fails(|d| d["cx"] = json!(1e12), &["`cx`: must be a position in pixels"]);
     fails(|d| remove(d, "h"), &["`h`: is missing beside `w`"]);
     fails(|d| remove(d, "w"), &["`w`: is missing beside `h`"]);
@@ -514,6 +521,12 @@ fn focal_lengths_under_other_names_are_read() {
     }
     // The usual name counts.
     assert_eq!(cameras(|d| d["fx"] = json!(7)), plain);
+    fails(with(json!({ "fx": 0 })), &["`fx`: must be above 0, is 0"]);
+    fails(with(json!({ "fx": 100, "fy": -110 })), &["`fy`: must be above 0, is -110"]);
+    fails(
+        with(json!({ "K": [[100, 0, 31], [0, -110, 25], [0, 0, 1]] })),
+        &["`K`: must have focal lengths above 0, is"],
+    );
     // COLMAP's order, and millimetres beside a field of view.
     fails(with(json!({ "K": [100, 31, 25, 0.01] })), &["`K`: must be fx, fy, cx, cy in this order, is [100,"]);
     let millimetres = json!({ "fx": 50, "fy": 50, "camera_angle_x": 0.2 });

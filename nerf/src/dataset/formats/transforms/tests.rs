@@ -123,8 +123,28 @@ fn frames_without_a_pose_are_left_out() {
         ("fl_x", json!(0), "fl_x`: must be above 0, is 0"),
         ("fl_y", json!(-800.5), "fl_y`: must be above 0, is -800.5"),
         ("cx", json!("Infinity"), "cx`: must be a finite number"),
+        ("fx", json!(0), "fx`: must be above 0, is 0"),
+        ("fy", json!("-12"), "fy`: must be above 0, is -12"),
+        ("fx", json!("NaN"), "fx`: must be a finite number"),
+        ("camera_angle_x", json!(0), "camera_angle_x`: must be above 0, is 0"),
+        ("camera_angle_y", json!(-0.5), "camera_angle_y`: must be above 0, is -0.5"),
+        ("K", json!([[0, 0, 4], [0, 9, 3], [0, 0, 1]]), "K`: must have focal lengths above 0, is [[0,0,4]"),
+        ("intrinsics", json!([9, 0, 4, 3]), "intrinsics`: must have focal lengths above 0, is [9,0,4,3]"),
+        ("camera_matrix", json!(([[0; 3]; 3])), "camera_matrix`: must have focal lengths above 0"),
+        (
+            "intrinsics",
+            json!([[9, 0, 4, 0], [0, -9, 3, 0], [0, 0, 1, 0]]),
+            "intrinsics`: must have focal lengths above",
+        ),
+        ("K", json!([[9, 0, "NaN"], [0, 9, 3], [0, 0, 1]]), "K`: must have finite numbers"),
+        ("K", json!({ "fx": 9, "fy": null, "cx": 4, "cy": 3 }), "K`: must have finite numbers"),
     ] {
         check(good(|d| d["frames"][1][field] = value), why);
+    }
+    // A length of another name that does not count.
+    for (own, other) in [("fl_x", "fx"), ("fl_x", "camera_angle_x"), ("fl_y", "camera_angle_y")] {
+        let both = |d: &mut Value| (d["frames"][1][own], d["frames"][1][other]) = (json!(12), json!(0));
+        assert_eq!(good(both).views.len(), 3, "{own} beside {other}");
     }
     // Most frames must have one, and other values are mistakes.
     let most = |field: &'static str, value: Value| {
@@ -133,6 +153,14 @@ fn frames_without_a_pose_are_left_out() {
     fails(most("transform_matrix", json!(null)), &["`frames[1].transform_matrix`: is missing"]);
     fails(most("fl_x", json!("NaN")), &["`frames[1].fl_x`: must be a finite number"]);
     fails(most("fl_x", json!(0)), &["`frames[1].fl_x`: must be above 0, is 0"]);
+    fails(most("camera_angle_x", json!(0)), &["`frames[1].camera_angle_x`: must be above 0, is 0"]);
+    fails(most("K", json!(([[0; 3]; 3]))), &["`frames[1].K`: must have focal lengths above 0, is [[0,0,0],"]);
+    fails(
+        |d| d["frames"][1]["camera_angle_x"] = json!(4),
+        &["`frames[1].camera_angle_x`: must be an angle in radians"],
+    );
+    let skewed = json!([[9, 1, 4], [0, 9, 3], [0, 0, 1]]);
+    fails(|d| d["frames"][1]["K"] = skewed, &["`frames[1].K`: must have the rows fx 0 cx"]);
     fails(|d| d["frames"][1]["fl_x"] = json!("wide"), &["`frames[1].fl_x`: must be a finite number"]);
 }
 

@@ -129,7 +129,7 @@ fn unwritable_colmap_captures_are_named() {
     };
     camera(&|c| c.lens = Lens::Fov { omega: 4.0 }, "camera`: omega: must be below pi (radians)");
     camera(&|c| c.lens = Lens::Brown { k: [f64::NAN; 6], p: [0.0; 2] }, "camera`: k1: must be a finite number");
-    camera(&|c| c.focal[1] = 0.0, "camera`: focal length: must be more than 0");
+    camera(&|c| c.focal[1] = 0.0, "camera`: focal length: must be a focal length in pixels");
     camera(&|c| c.centre[0] = f64::INFINITY, "camera`: cx: must be a finite number");
     camera(&|c| c.width = 0, "camera`: width: must be 1 to");
     camera(&|c| c.pose.matrix3 *= 1.01, "pose`: must be a rotation");
@@ -175,6 +175,8 @@ proptest! {
         numbers in prop::array::uniform32(prop::num::f64::NORMAL | prop::num::f64::SUBNORMAL | prop::num::f64::ZERO),
         q in prop::array::uniform4(-1.0..1.0_f64),
         eye in prop::array::uniform3(-1e3..1e3_f64),
+        focal in prop::array::uniform2(1e-3..1e9_f64),
+        centre in prop::array::uniform2(-48.0..96.0_f64),
         color in any::<[u8; 3]>(),
     ) {
         prop_assume!(q.iter().map(|x| x * x).sum::<f64>() > 0.01);
@@ -188,8 +190,7 @@ proptest! {
             s: [numbers[6], numbers[7]],
         };
         let mut one = view("one", lens, pose);
-        one.camera.focal = [numbers[8].abs().max(5e-324), numbers[9].abs().max(5e-324)];
-        one.camera.centre = [numbers[10], numbers[11]];
+        (one.camera.focal, one.camera.centre) = (focal, centre);
         let position = DVec3::new(numbers[12], numbers[13], numbers[14]);
         let before = capture(vec![one], vec![Point { position, color, error: numbers[15], views: 0 }]);
         let [a, b] = Encoding::ALL.map(|encoding| parsed(&before, encoding));
