@@ -128,7 +128,8 @@ impl Scene {
             (true, Some(_)) => SceneType::ForwardFacing,
         };
         let reason = "as in training".to_owned();
-        let analysis = SceneAnalysis { transform, scene_type, bounds, near, far, ndc, empty: None, reason };
+        let (empty, hollow) = (None, false);
+        let analysis = SceneAnalysis { transform, scene_type, bounds, near, far, ndc, empty, hollow, reason };
         Ok(Opened::new(self, Some((self.capture(hold_out, description)?, analysis)), None))
     }
 

@@ -359,8 +359,13 @@ fn doctor_finds_hollow_alpha_and_identical_images() {
     };
     planted.redraw(3, inverted);
     assert!(planted.report().finds(Kind::HollowAlpha).is_none(), "a single image");
+    assert!(planted.cameras().finds(Kind::HollowAlpha).is_none());
     (0..ALL).for_each(|view| planted.redraw(view, inverted));
+    let cameras = planted.cameras();
+    let finding = cameras.finds(Kind::HollowAlpha).unwrap();
+    assert_eq!(finding.what, "the alpha channel of most images is transparent inside an opaque border");
     let report = planted.report();
+    assert_eq!(report.findings.iter().filter(|finding| finding.kind == Kind::HollowAlpha).count(), 1);
     let hollow = report.finds(Kind::HollowAlpha).unwrap();
     assert!(hollow.severity == Warning && hollow.views.len() > ALL / 2, "{hollow:#?}");
     let grey = Image { width: SIZE, height: SIZE, channels: 3, data: vec![0.5; 3 * SIZE * SIZE] };

@@ -2,7 +2,7 @@
 
 use super::{PLAIN, Place, SIZE, SMALL, png};
 use raygrad::Real;
-use raygrad::nerf::dataset::{Dataset, Split, load};
+use raygrad::nerf::dataset::{Capture, Dataset, Split, load};
 use raygrad::nerf::{Camera, Config, Image, Model, SceneBox};
 use serde_json::{Value, json};
 
@@ -251,6 +251,27 @@ fn background_follows_transparency() {
 }
 
 #[test]
+fn training_warns_of_inverted_alpha() {
+    let place = Place::with_scene();
+    let warns = |run: &str| {
+        let output = place.command(&format!("train scene --steps 1 --out {run} {SMALL}")).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success(), "{said}");
+        said.contains(
+            "warning: hollow-alpha: the alpha channel of most images is transparent inside an opaque border; ",
+        )
+    };
+    assert!(!warns("plain"));
+    for view in Capture::read(place.path("scene")).unwrap().present() {
+        let path = view.image.as_ref().unwrap();
+        let mut image = Image::open(path).unwrap();
+        image.data.chunks_exact_mut(4).for_each(|pixel| pixel[3] = 1.0 - pixel[3]);
+        image.save_png(path).unwrap();
+    }
+    assert!(warns("inverted"));
+}
+
+#[test]
 fn eval_of_training_images_as_test_is_an_error() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));
@@ -312,7 +333,7 @@ fn forward_facing_capture_trains_in_ndc() {
     );
     let ndc = model(&place, "ahead").scene_box.ndc.unwrap();
     // Up is preserved, and the frustum's eye is behind the cameras. A nearer near plane is nearer in the frustum.
-    let survey = raygrad::nerf::dataset::Capture::read(place.path("captured")).unwrap().analyze_scene(None).unwrap();
+    let survey = Capture::read(place.path("captured")).unwrap().analyze_scene(None).unwrap();
     assert_eq!(survey.ndc, Some(ndc));
     assert!(ndc.axes.y_axis.z > 0.999 && ndc.eye.z.abs() < 1.0, "{ndc:?}");
     place.succeeds(&format!("train captured --near 0.01 --steps 1 --out close {SMALL}"));

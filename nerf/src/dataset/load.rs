@@ -218,7 +218,7 @@ impl Capture {
     /// [`SceneAnalysis::new`].
     pub fn analyze_scene(&self, asked: Option<SceneType>) -> Result<SceneAnalysis> {
         let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
-        let ([mut clear, mut white, mut alpha], total) = ([0; 3], looked_at.len());
+        let ([mut clear, mut white, mut alpha, mut hollow], total) = ([0; 4], looked_at.len());
         let (mut faint, mut low) = (vec![], vec![]);
         for view in looked_at {
             let Some(path) = &view.image else { continue };
@@ -232,6 +232,7 @@ impl Capture {
                     // A transparent border may be left by undistortion, so it is no sign of an empty background.
                     clear += usize::from(photo.transparent_share() > CLEAR);
                     alpha += usize::from(least < 1.0);
+                    hollow += usize::from(photo.is_hollow());
                     white += usize::from(least >= OPAQUE && photo.white_border() > WHITE_BORDER);
                 }
                 Err(error) if has_alpha => return Err(name(error)),
@@ -268,7 +269,7 @@ impl Capture {
             _ if 2 * alpha > total && self.format == Format::Blender => Some(EmptyBackground::Transparent),
             _ => None,
         };
-        SceneAnalysis::new(self, empty, asked)
+        Ok(SceneAnalysis { hollow: 2 * hollow > total, ..SceneAnalysis::new(self, empty, asked)? })
     }
 
     /// [Analyses](Self::analyze_scene) a scene whose masks [cut out an object](LoadOptions::mask_as_alpha): the

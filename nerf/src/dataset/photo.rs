@@ -201,9 +201,25 @@ impl Photo {
         self.border(|pixel| pixel[..3].iter().all(|value| *value >= WHITE))
     }
 
-    /// The share of the one-pixel border that is opaque: 0 to 1.
-    pub(crate) fn opaque_border(&self) -> f64 {
-        self.border(|pixel| pixel[3] >= OPAQUE)
+    /// Returns true if alpha is transparent inside an opaque border, as if it were inverted. An object that touches the
+    /// border may be transparent there too; then most of the middle must be.
+    pub(crate) fn is_hollow(&self) -> bool {
+        /// The least opaque share of the border, and the least transparent share of the image.
+        const WHOLE: [f64; 2] = [0.98, 0.05];
+        /// The same where an object touches the border: of the border, and of the middle half of both sides. A cut-out
+        /// object that reaches over an edge covers less of the border, or else the middle.
+        const TOUCHED: [f64; 2] = [0.75, 0.5];
+        if !self.has_alpha() {
+            return false;
+        }
+        let border = self.border(|pixel| pixel[3] >= OPAQUE);
+        let middle = || {
+            let [columns, rows] = [self.width, self.height].map(|side| side / 4..side - side / 4);
+            let clear = rows.clone().flat_map(|y| columns.clone().map(move |x| (x, y)));
+            let clear = clear.filter(|(x, y)| self.pixel(*x, *y)[3] == 0.0).count();
+            clear as f64 / (columns.len() * rows.len()).max(1) as f64
+        };
+        border > WHOLE[0] && self.transparent_share() > WHOLE[1] || border > TOUCHED[0] && middle() > TOUCHED[1]
     }
 
     /// The share of the pixels of the border that pass a test: 0 to 1.

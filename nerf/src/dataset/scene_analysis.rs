@@ -30,6 +30,9 @@ pub struct SceneAnalysis {
     pub ndc: Option<Ndc>,
     /// Why the background seems empty, if it does.
     pub empty: Option<EmptyBackground>,
+    /// Whether alpha is transparent inside an opaque border in most of the images that were looked at, as if it were
+    /// inverted.
+    pub hollow: bool,
     /// The reason for `scene_type`, in a few words.
     pub reason: String,
 }
@@ -117,6 +120,7 @@ impl SceneAnalysis {
                 far,
                 ndc: None,
                 empty,
+                hollow: false,
                 reason: "the NeRF-synthetic convention: all within 1.5 units of the origin".to_owned(),
             });
         }
@@ -180,7 +184,7 @@ impl SceneAnalysis {
             }
             SceneType::Bounded | SceneType::Unbounded => None,
         };
-        Ok(SceneAnalysis { transform, scene_type, bounds: BOX, near, far, ndc, empty, reason })
+        Ok(SceneAnalysis { transform, scene_type, bounds: BOX, near, far, ndc, empty, hollow: false, reason })
     }
 }
 

@@ -14,9 +14,6 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 const LONGEST: usize = 800;
 /// The longest side of the images that are compared with each other.
 const SMALL: usize = 200;
-/// The least transparent share of a hollow image, and the least opaque share of its border.
-const HOLLOW: f64 = 0.05;
-const OPAQUE_BORDER: f64 = 0.98;
 /// The least luminance; darker pixels count as this.
 const DARK: f64 = 0.01;
 
@@ -24,7 +21,7 @@ const DARK: f64 = 0.01;
 pub(super) struct Look {
     /// True if a pixel is transparent; `None` without an alpha channel.
     pub transparent: Option<bool>,
-    /// True if the border is opaque and pixels within it are transparent.
+    /// True if alpha is transparent inside an opaque border.
     pub hollow: bool,
     /// True if the colour profile cannot be read.
     pub unread_profile: bool,
@@ -65,7 +62,7 @@ fn look_at(view: &View) -> Result<Look> {
     let photo = Photo::open(&path, size)?;
     let unread_profile = Photo::has_unread_profile(&path)?;
     let transparent = photo.has_alpha().then(|| photo.transparent_share() > 0.0);
-    let hollow = photo.transparent_share() > HOLLOW && photo.opaque_border() > OPAQUE_BORDER;
+    let hollow = photo.is_hollow();
     let [middle, small] = [LONGEST, SMALL].map(|longest| photo.at_most(longest));
     let mask = view.mask_photo(None)?;
     let used = mask

@@ -48,6 +48,9 @@ impl Default for DoctorOptions<'_> {
 pub fn examine_cameras(capture: &Capture, analysis: Result<&SceneAnalysis, &Error>) -> Report {
     let mut findings = Findings::default();
     let facts = without_pixels(capture, analysis.ok(), &mut findings);
+    if analysis.is_ok_and(|analysis| analysis.hollow) {
+        findings.add(FindingKind::HollowAlpha, &[&"most images"]);
+    }
     Report { facts, findings: findings.sorted(analysis.err()) }
 }
 

@@ -44,6 +44,41 @@ fn resizing_to_other_ratios_shares_pixels() {
     assert_eq!(small, [15000, 17000, 19000, 27000, 29000, 31000]);
 }
 
+/// Rows of letters as an image: `#` is opaque, others are transparent.
+fn shape(rows: &[&str]) -> Photo {
+    let values: Vec<u8> =
+        rows.iter().flat_map(|row| row.bytes()).flat_map(|c| [9, 9, 9, 255 * u8::from(c == b'#')]).collect();
+    bytes(rows[0].len(), rows.len(), 4, &values)
+}
+
+#[test]
+fn hollow_alpha_is_told_from_objects_that_touch_an_edge() {
+    // An inverted object: within the image, over one edge and over two.
+    let within = ["########", "########", "###..###", "###..###", "########", "########"];
+    let over = ["########", "##....##", "##....##", "##....##", "##....##", "###..###"];
+    let across = ["########", "##....##", ".......#", ".......#", "##....##", "###..###"];
+    for rows in [within, over, across] {
+        assert!(shape(&rows).is_hollow(), "{rows:?}");
+        // The same object on an empty background.
+        let inverted = rows.map(|row| row.chars().map(|c| if c == '#' { '.' } else { '#' }).collect::<String>());
+        assert!(!shape(&inverted.each_ref().map(String::as_str)).is_hollow(), "{inverted:?}");
+    }
+    for rows in [
+        // An object that fills all but two corners.
+        [".#######", "########", "########", "########", "########", "#######."],
+        // A skyline, and a street below the sky.
+        ["........", "........", "........", "##..####", "########", "########"],
+        ["........", "#......#", "##....##", "##....##", "###..###", "########"],
+        // A hole beside the middle of an object over an edge.
+        ["########", "#..#####", "#..#####", "########", "########", "###.####"],
+        ["########", "########", "########", "########", "########", "########"],
+        ["........", "........", "........", "........", "........", "........"],
+    ] {
+        assert!(!shape(&rows).is_hollow(), "{rows:?}");
+    }
+    assert!(!Photo::from(Image::new(8, 6, 3)).is_hollow() && !bytes(1, 1, 4, &[0; 4]).is_hollow());
+}
+
 #[test]
 fn downsized_image_keeps_its_aspect() {
     let cases = [([3200, 100], [1600, 50]), ([20, 1700], [19, 1600]), ([1601, 1], [1600, 1]), ([9, 8], [9, 8])];
