@@ -58,9 +58,38 @@ fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
     let values = match decoded {
         DynamicImage::ImageLuma8(image) => image.into_raw().into_iter().map(f64::from).collect(),
         DynamicImage::ImageLuma16(image) => image.into_raw().into_iter().map(f64::from).collect(),
-        _ => return Err(wrong("has colour channels; use one channel of 8 or 16 bits, or a .npy array".into())),
+        decoded => grey(&decoded).ok_or_else(|| {
+            let what = "has colours, so it is a picture of depths: write the depths themselves, as PNG of one channel \
+                        with 8 or 16 bits, or as .npy";
+            wrong(what.to_owned())
+        })?,
     };
     Ok((size, values))
+}
+
+/// The values of an image with several channels whose pixels are grey; 0 where it is transparent. `None` if it has
+/// colours.
+fn grey(image: &DynamicImage) -> Option<Vec<f64>> {
+    fn values<T: Copy + Into<f64>>(values: &[T], channels: usize) -> Option<Vec<f64>> {
+        let pixel = |pixel: &[T]| {
+            let (colors, alpha) = pixel.split_at(channels - usize::from(channels.is_multiple_of(2)));
+            let value = colors[0].into();
+            let is_grey = colors.iter().all(|color| (*color).into() == value);
+            let is_clear = alpha.iter().any(|alpha| (*alpha).into() == 0.0);
+            (is_grey || is_clear).then_some(if is_clear { 0.0 } else { value })
+        };
+        values.chunks_exact(channels).map(pixel).collect()
+    }
+    let channels = usize::from(image.color().channel_count());
+    match image {
+        DynamicImage::ImageLumaA8(image) => values(image, channels),
+        DynamicImage::ImageLumaA16(image) => values(image, channels),
+        DynamicImage::ImageRgb8(image) => values(image, channels),
+        DynamicImage::ImageRgb16(image) => values(image, channels),
+        DynamicImage::ImageRgba8(image) => values(image, channels),
+        DynamicImage::ImageRgba16(image) => values(image, channels),
+        _ => None,
+    }
 }
 
 /// A depth image along the optical axis, as [`View::depth`](super::View::depth) reads it; 0 where there is no depth.
@@ -152,7 +181,7 @@ impl Depths {
 mod tests {
     use super::*;
     use glam::{DAffine3, DVec3};
-    use image::Rgb;
+    use image::{LumaA, Rgb, Rgba};
 
     #[test]
     fn depth_files_round_trip() {
@@ -242,6 +271,26 @@ mod tests {
     }
 
     #[test]
+    fn grey_pixels_in_several_channels_are_depths() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("depth.png");
+        let value = |x: u32, y: u32| 1000 * x + 300 * y;
+        let wide = |x: u32, y: u32| [value(x, y) as u16; 3];
+        let expected: Vec<f64> = (0..6).map(|i| f64::from(value(i % 3, i / 3))).collect();
+        ImageBuffer::<Rgb<u16>, _>::from_fn(3, 2, |x, y| Rgb(wide(x, y))).save(&path).unwrap();
+        assert_eq!(decoded(&path).unwrap(), ([3, 2], expected.clone()));
+        let with_alpha = |x: u32, y: u32| {
+            let [r, g, b] = if x == 1 { [5000, 0, 9] } else { wide(x, y) };
+            Rgba([r, g, b, if x == 1 { 0 } else { 7 }])
+        };
+        ImageBuffer::<Rgba<u16>, _>::from_fn(3, 2, with_alpha).save(&path).unwrap();
+        let hidden: Vec<f64> = (0..6).map(|i| if i % 3 == 1 { 0.0 } else { expected[i] }).collect();
+        assert_eq!(decoded(&path).unwrap().1, hidden, "nothing is measured where it is transparent");
+        ImageBuffer::<LumaA<u8>, _>::from_fn(3, 2, |x, _| LumaA([x as u8, 255])).save(&path).unwrap();
+        assert_eq!(decoded(&path).unwrap().1, [0.0, 1.0, 2.0, 0.0, 1.0, 2.0]);
+    }
+
+    #[test]
     fn depth_file_of_other_form_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let camera = Camera::from_angle(3, 2, 0.1, DAffine3::IDENTITY);
@@ -254,8 +303,10 @@ mod tests {
         fails("broken.png", "cannot be decoded");
         std::fs::write(folder.path().join("0.exr"), [EXR, b"\x02\0\0\0"].concat()).unwrap();
         fails("0.exr", "is EXR, which raygrad does not decode: write depths as PNG of 16 bits or as .npy");
-        ImageBuffer::<Rgb<u8>, _>::new(3, 2).save(folder.path().join("color.png")).unwrap();
-        fails("color.png", "has colour channels; use one channel of 8 or 16 bits, or a .npy array");
+        // The colours of a map, but for one grey pixel.
+        let map = |x: u32, y: u32| Rgb(if x + y == 0 { [7; 3] } else { [7, 8, 7] });
+        ImageBuffer::<Rgb<u8>, _>::from_fn(3, 2, map).save(folder.path().join("color.png")).unwrap();
+        fails("color.png", "has colours, so it is a picture of depths: write the depths themselves, as PNG of one");
         ImageBuffer::<Luma<u8>, _>::new(2, 3).save(folder.path().join("turned.png")).unwrap();
         ImageBuffer::<Luma<u8>, _>::new(9, 3).save(folder.path().join("wide.png")).unwrap();
         fails("turned.png", "has 2x3 depths");
