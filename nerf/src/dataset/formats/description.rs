@@ -3,13 +3,13 @@
 use super::locate::{shown, walk};
 use super::{blender, colmap, llff, transforms};
 use crate::camera::lens::Lens;
-use crate::dataset::capture::{Capture, Format};
+use crate::dataset::capture::{Capture, Format, View};
 use crate::dataset::frames::Split;
 use crate::error::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Files of other programs that are no capture yet: a file or folder, the program, and the remedy.
-const EXPORTS: [(&str, &str, &str); 18] = [
+const EXPORTS: [(&str, &str, &str); 23] = [
     ("keyframes", "a raw export of Polycam", "convert it with nerfstudio's `ns-process-data polycam`"),
     ("rgbd", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
     ("EXR_RGBD", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
@@ -27,6 +27,11 @@ const EXPORTS: [(&str, &str, &str); 18] = [
     ("sfm_data.bin", "a scene of OpenMVG", "convert it with `openMVG_main_openMVG2Colmap`"),
     ("cameras.sfm", "a scene of Meshroom", "convert it with `aliceVision_exportColmap`"),
     ("bundle.out", "a reconstruction of Bundler", "write its cameras as transforms.json"),
+    ("train/pose", "a dataset of NeRF++", "write its matrices as transforms.json"),
+    ("traj.txt", "a sequence of Replica", "write its matrices as transforms.json"),
+    ("groundtruth.txt", "a sequence of TUM RGB-D", "write its poses as transforms.json"),
+    ("cfg_args", "an output of 3D Gaussian Splatting", "name the capture that its `source_path` names"),
+    ("dataparser_transforms.json", "a run of nerfstudio", "name the capture that it was trained on"),
     ("database.db", "a COLMAP project without a model", "run COLMAP's mapper, or `raygrad prepare` on the images"),
 ];
 
@@ -223,16 +228,20 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
     check_single(path, &all)?;
     let mut capture = most_complete(&all, needed)?;
     let model = below(path, &capture.file);
-    if capture.format == Format::Colmap && capture.present().next().is_none() {
-        let around = colmap::read_model(path, &capture.file)?;
+    if matches!(capture.format, Format::Colmap | Format::Transforms) && capture.present().next().is_none() {
+        let around = Description::new(capture.format, path, capture.file.clone()).read(needed)?;
         let first = around.present().next().and_then(|view| Some(below(path, view.image.as_ref()?)));
         // Undistorted models have images of their own.
-        let is_undistorted = around.views.iter().all(|view| view.camera.lens == Lens::Pinhole);
+        let is_pinhole = |view: &View| view.camera.lens == Lens::Pinhole;
+        let is_undistorted = capture.format == Format::Colmap && around.views.iter().all(is_pinhole);
         match first {
-            Some(image) if is_undistorted => capture.assumptions.push(format!(
-                "`{image}` is not beside `{model}`, which may have undistorted images of its own: to use these images, \
-                 move the model to `sparse/0`"
-            )),
+            Some(image) if is_undistorted => {
+                let what = format!(
+                    "has no image beside it, and may have undistorted images of its own: copy those there or, to use \
+                     others, such as `{image}`, move the model to `sparse/0`"
+                );
+                return Err(Error::file(&capture.file, what));
+            }
             Some(image) => {
                 capture = around;
                 capture.assumptions.push(format!("no images are beside `{model}`: used others, such as `{image}`"));

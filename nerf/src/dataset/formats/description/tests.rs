@@ -86,6 +86,27 @@ fn most_complete_description_counts() {
 }
 
 #[test]
+fn a_stale_list_of_images_gives_way_to_a_complete_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    write(path, Format::Colmap, [10, 10], 0);
+    write(path, Format::Transforms, [10, 10], 0);
+    let file = path.join("transforms.json");
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::write(
+        &file,
+        (0..3).fold(text.clone(), |text, i| text.replace(&format!("/{i}.png"), &format!("/old{i}.png"))),
+    )
+    .unwrap();
+    let capture = read(path, None).unwrap();
+    assert_eq!((capture.format, capture.present().count()), (Format::Colmap, 10));
+    assert_eq!(capture.assumptions, ["images found: `sparse/0` 10 of 10, `transforms.json` 7 of 10; used the first"]);
+    assert_eq!(read(path, Some(Format::Transforms)).unwrap().present().count(), 7, "as requested");
+    std::fs::write(&file, text).unwrap();
+    assert_eq!(read(path, None).unwrap().format, Format::Transforms, "a whole list");
+}
+
+#[test]
 fn both_encodings_of_a_model_count() {
     let [folder, other] = [0, 1].map(|_| tempfile::tempdir().unwrap());
     let path = folder.path();
@@ -221,11 +242,11 @@ fn captures_are_found_in_unusual_places() {
             ["cameras.bin", "images.bin"].map(|name| [format!("sparse/0/{name}"), format!("{place}/sparse/{name}")]);
         let folder = moved(Format::Colmap, &files.each_ref().map(|[from, to]| (from.as_str(), to.as_str())));
         let path = folder.path();
-        let capture = read(path, None).unwrap();
-        assert_eq!(capture.present().count(), 0, "images of other cameras");
-        let note =
-            format!("`images/0.png` is not beside `{place}/sparse/images.bin`, which may have undistorted images");
-        assert!(capture.assumptions[1].starts_with(&note), "{:?}", capture.assumptions);
+        let message = read(path, None).unwrap_err().to_string();
+        let expected =
+            "has no image beside it, and may have undistorted images of its own: copy those there or, to use";
+        assert!(message.contains(&format!("{place}/sparse/images.bin: {expected}")), "{message}");
+        assert!(message.ends_with("others, such as `images/0.png`, move the model to `sparse/0`"), "{message}");
         std::fs::rename(path.join("images"), path.join(place).join("images")).unwrap();
         check(&folder, &format!("{place}/sparse/images.bin"), place);
     }
@@ -270,6 +291,25 @@ fn captures_are_found_in_unusual_places() {
         let inside = format!("scene/{file}");
         check(&moved(format, &[(file, &inside), ("images", "scene/images")]), &inside, "scene");
     }
+    // Paths from the searched folder, and images beside the folder of the file.
+    for (place, images) in [("output", "images"), ("nerfstudio", "resized")] {
+        let file = format!("{place}/transforms.json");
+        let folder = moved(Format::Transforms, &[("transforms.json", &file)]);
+        let path = folder.path();
+        if images != "images" {
+            std::fs::rename(path.join("images"), path.join(images)).unwrap();
+            let text = std::fs::read_to_string(path.join(&file)).unwrap();
+            std::fs::write(path.join(&file), text.replace("images/", "")).unwrap();
+        }
+        let capture = read(path, None).unwrap();
+        assert_eq!((capture.present().count(), &*capture.folder), (3, path), "{file}");
+        let note = format!("no images are beside `{file}`: used others, such as `{images}/0.png`");
+        assert_eq!(capture.assumptions.last(), Some(&note));
+        assert_eq!(read_file(path, &path.join(&file), true).unwrap().present().count(), 3, "as a run keeps it");
+        // Some images beside the file are its own.
+        kit::picture(&path.join(place).join(if images == "images" { "images/0.png" } else { "0.png" }), 8, 6);
+        assert_eq!(read(path, None).unwrap().present().count(), 1);
+    }
     // Usual places come first.
     let folder = moved(Format::Transforms, &[("transforms.json", "old/transforms.json"), ("images", "old/images")]);
     write(folder.path(), Format::Llff, [1, 1], 0);
@@ -294,8 +334,7 @@ fn several_captures_in_unusual_places_are_named() {
     std::fs::copy(path.join("b/transforms.json"), path.join("b/transforms_2.json")).unwrap();
     assert!(read(path, None).unwrap_err().to_string().contains("`b/transforms.json`, `b/transforms_2.json`: name"));
     // Hidden folders, deeper ones and other files.
-    let places =
-        [".cache/transforms.json", "a/b/c/d/e/transforms.json", "dataparser_transforms.json", "transform_2.json"];
+    let places = [".cache/transforms.json", "a/b/c/d/e/transforms.json", "transform_2.json"];
     for place in places {
         let folder = moved(Format::Transforms, &[("transforms.json", place)]);
         assert!(read(folder.path(), None).unwrap_err().to_string().contains("is not a dataset"), "{place}");
