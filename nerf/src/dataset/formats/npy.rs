@@ -101,13 +101,16 @@ fn member<'a>(header: &'a str, key: &str) -> Option<&'a str> {
     Some(rest.trim_start().strip_prefix(':')?.trim_start())
 }
 
-/// The two extents of the shape.
+/// The two extents of the shape. Some programs append an axis of extent 1.
 fn shape(header: &str) -> Result<[usize; 2], String> {
     let extents = member(header, "shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')'));
     let (extents, _) = extents.ok_or(BROKEN)?;
     let words = extents.split(',').map(str::trim).filter(|extent| !extent.is_empty());
     let numbers = words.map(|extent| extent.parse().map_err(|_| BROKEN)).take(9).collect::<Result<Vec<usize>, _>>()?;
-    numbers.try_into().map_err(|numbers: Vec<usize>| format!("has {} axes, not rows and columns", numbers.len()))
+    match numbers[..] {
+        [rows, columns] | [rows, columns, 1] => Ok([rows, columns]),
+        _ => Err(format!("has {} axes, not rows and columns", numbers.len())),
+    }
 }
 
 #[cfg(test)]
@@ -139,6 +142,8 @@ mod tests {
         assert_eq!((Matrix::read(&written), (written.len() - 48) % 64), (Ok(expected), 0));
         let single = write_single([2, 3], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.5]);
         assert_eq!((Matrix::read(&single), single.len() % 64), (Matrix::read(&written), 24));
+        let third = file(1, "{'descr': '<f8', 'fortran_order': False, 'shape': (2, 3, 1), }", &doubles);
+        assert_eq!(Matrix::read(&third), Matrix::read(&rows));
         let empty = file(1, "{'descr': '<f8', 'fortran_order': True, 'shape': (0, 17), }", &[]);
         assert_eq!(Matrix::read(&empty), Ok(Matrix { rows: 0, columns: 17, values: vec![] }));
     }
@@ -158,7 +163,8 @@ mod tests {
         fails(&of("<i8", "1, 1", 8), "of type `<i8`");
         fails(&of("<f8\n", "1, 1", 8), "of type `<f8\\n`");
         fails(&of("<f8", "1,", 8), "has 1 axes");
-        fails(&of("<f8", "1, 1, 1", 8), "has 3 axes");
+        fails(&of("<f8", "1, 1, 2", 16), "has 3 axes");
+        fails(&of("<f8", "1, 1, 1, 1", 8), "has 4 axes");
         fails(&of("<f8", "1, x", 8), "is not a complete npy file: copy it again");
         fails(&of("<f8", "2, 1", 8), "has 8 bytes of elements, which do not fit the shape (2, 1): copy it again");
         // The header announces more elements than memory could hold.
