@@ -39,8 +39,8 @@ const DISTORTIONS: [&str; 6] =
 /// object of fx, fy, cx and cy.
 const MATRICES: [&str; 6] = ["K", "intrinsics", "camera_intrinsics", "intrinsic_matrix", "camera_matrix", "cam_K"];
 
-/// Names of a focal length that may be in millimetres.
-const FOCAL_LENGTHS: [&str; 2] = ["focal_length", "focal"];
+/// Names of a focal length that may be in millimetres, and of a field of view that may be in degrees.
+const UNCLEAR: [&str; 8] = ["focal_length", "focal", "fov", "fovx", "fov_x", "FovX", "hfov", "field_of_view"];
 
 /// The least focal length of other names than instant-ngp's, as a share of the image's side: some are in units of the
 /// side.
@@ -234,7 +234,7 @@ impl Layers<'_, '_> {
             ([Some(x), Some(y)], _) => Ok([x, y]),
             ([None, None], _) => {
                 let unread = [self.frame, self.top].into_iter().find_map(|object| {
-                    let mut names = MATRICES.into_iter().chain(FOCAL_LENGTHS);
+                    let mut names = MATRICES.into_iter().chain(UNCLEAR);
                     names.find_map(|name| Some((object.field(name), object.get(name)?)))
                 });
                 let unread =

@@ -51,6 +51,9 @@ pub(super) fn read_file(folder: &Path, file: &Path, needed: bool) -> Result<Capt
     if needed {
         assumptions.extend(read_splits(&top, &mut views, &left_out)?);
     }
+    if let Some(frames) = top.get("test_frames").and_then(Value::as_array).filter(|frames| !frames.is_empty()) {
+        assumptions.push(format!("the {} frames of `test_frames` are not read, only those of `frames`", frames.len()));
+    }
     let notes = &mut assumptions;
     let scale = unused(top.positive("applied_scale"), notes).unwrap_or(1.0);
     let transform = unused(matrix::affine(&top, "applied_transform"), notes).unwrap_or(DAffine3::IDENTITY);

@@ -539,7 +539,7 @@ fn focal_lengths_under_other_names_are_read() {
     fails(with(json!({ "fx": 0.9, "fy": 0.9 })), &["`fl_x`: is 0.9 in `fx`, which must be in pixels"]);
     fails(with(json!({ "K": [100, 110, 31, "NaN"] })), &["`K`: must have finite numbers, is [100,110,31,"]);
     let phone = json!({ "fx": 100, "fy": 110, "cx": 31, "cy": 25, "width": 1920 });
-    for (name, value) in [("intrinsics", phone), ("focal_length", json!(4.2))] {
+    for (name, value) in [("intrinsics", phone), ("focal_length", json!(4.2)), ("fov", json!(56.2))] {
         let unread = format!("raygrad does not read `{name}`, ");
         fails(with(json!({ name: value })), &["`camera_angle_x`: is missing", "as fl_x and fl_y", &unread]);
     }

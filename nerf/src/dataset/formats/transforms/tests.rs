@@ -625,6 +625,14 @@ fn masks_take_no_place_of_images() {
 }
 
 #[test]
+fn frames_in_another_list_give_a_note() {
+    let with = |list: Value| good(|d| d["test_frames"] = list).assumptions;
+    let note = "the 2 frames of `test_frames` are not read, only those of `frames`";
+    assert_eq!(with(frames(&["images/8.png", "images/9.png"])), [note]);
+    assert_eq!([with(json!([])), with(json!(null))], [const { Vec::<String>::new() }; 2]);
+}
+
+#[test]
 fn moving_scenes_give_notes() {
     let timed = |times: [f64; 3]| {
         let set = |d: &mut Value| (0..3).for_each(|i| d["frames"][i]["time"] = json!(times[i]));
