@@ -35,7 +35,7 @@ const FINER: f64 = 0.5;
 
 /// Writes the page of a run.
 pub fn run(run: &Run, out: &Path, job: &Job) -> Result<()> {
-    let model = marched(run.model()?)?;
+    let model = marched(run.model()?, MarchingConfig::default())?;
     let page = page(run, &model, job.mark()).map_err(|what| Error::file(out, what))?;
     job.check(out)?;
     write_atomic(out, page.as_bytes())?;
@@ -43,11 +43,10 @@ pub fn run(run: &Run, out: &Path, job: &Job) -> Result<()> {
     print(&format!("exported a scene page of {megabytes:.1} MB: {}\n", out.display()))
 }
 
-/// The model with samples by marching, as the shader takes them. Proposals become steps through the cells that the
-/// field occupies.
-fn marched(mut model: Model<f32>) -> Result<Model<f32>> {
+/// The model with samples by marching, as the shader takes them. Proposals become steps, by `config`, through the cells
+/// that the field occupies.
+fn marched(mut model: Model<f32>, mut config: MarchingConfig) -> Result<Model<f32>> {
     if model.config.sampler.kind() == ProposalConfig::KIND {
-        let mut config = MarchingConfig::default();
         if model.config.unbounded {
             config = config.cascaded();
         }
@@ -277,6 +276,12 @@ mod tests {
         Model::new(config, extent, 0).unwrap()
     }
 
+    fn few_cells() -> MarchingConfig {
+        let mut config = MarchingConfig::default();
+        config.occupancy.resolution = 32;
+        config
+    }
+
     fn as_it_is(_: &mut Config, _: &mut SceneBox) {}
 
     fn give(model: &mut Model<f32>, name: &str, values: &[f32]) {
@@ -297,7 +302,7 @@ mod tests {
         let by_proposals = model.render(&camera, [1.0; 3]).color;
         let error = check(&model).err().unwrap();
         assert!(error.contains("`marching` or `proposal`"), "{error}");
-        let stepped = marched(model).unwrap();
+        let stepped = marched(model, few_cells()).unwrap();
         assert!(check(&stepped).is_ok());
         let by_steps = stepped.render(&camera, [1.0; 3]).color;
         let alike = psnr(&by_steps, &by_proposals);
@@ -317,7 +322,7 @@ mod tests {
                 }
             });
             let occupied = |model: Model<f32>| {
-                let stepped = marched(model).unwrap();
+                let stepped = marched(model, few_cells()).unwrap();
                 let grid = stepped.marching().unwrap().view_grid();
                 assert_eq!(grid.bounds() != grid.outer_bounds(), unbounded);
                 grid.occupied_share()
