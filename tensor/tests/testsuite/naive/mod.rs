@@ -5,12 +5,18 @@
 //! that only add and multiply must be right to the bit, and f32 results within the error that their documentation
 //! states. A lost element or a wrong border is far beyond either.
 
+#[cfg(feature = "gemm")]
 mod elementwise;
+#[cfg(feature = "gemm")]
 mod extremum;
+#[cfg(feature = "gemm")]
 mod indices;
+#[cfg(feature = "gemm")]
 mod layout;
 mod matmul;
+#[cfg(feature = "gemm")]
 mod reduce;
+#[cfg(feature = "gemm")]
 mod rows;
 mod support;
 mod windows;
@@ -26,6 +32,7 @@ fn naive_agrees_on_all_simd_levels_and_threads() {
     if std::env::var_os(support::INSTALLED).is_some() {
         return;
     }
+    let least = if cfg!(feature = "gemm") { 16 } else { 2 };
     let runs = [("scalar", "1", ""), ("v3", "3", ""), ("v4", "8", ""), ("v3", "2", "3")];
     let children = runs.map(|(level, threads, installed)| {
         let mut command = Command::new(std::env::current_exe().unwrap());
@@ -38,6 +45,6 @@ fn naive_agrees_on_all_simd_levels_and_threads() {
         let errors = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success(), "{run:?}:\n{text}\n{errors}");
         let passed = text.lines().find_map(|line| line.strip_prefix("test result: ok. ")?.split(' ').next());
-        assert!(passed.and_then(|count| count.parse().ok()).unwrap_or(0) >= 16, "{run:?} tested nothing:\n{text}");
+        assert!(passed.and_then(|count| count.parse().ok()).unwrap_or(0) >= least, "{run:?} tested nothing:\n{text}");
     }
 }
