@@ -320,8 +320,7 @@ impl Capture {
         }
         let present = evenly_spaced(present, reading.views);
         // All headers are checked before any image is decoded.
-        let listed: HashSet<&Path> = self.present().filter_map(|view| view.image.as_deref()).collect();
-        let plan = |i: usize| self.named(present[i], Plan::new(self, &listed, present[i], *reading));
+        let plan = |i: usize| self.named(present[i], Plan::new(self, present[i], *reading));
         let plans = parallel::collect(present.len(), plan);
         let plans = plans.into_iter().collect::<Result<Vec<_>>>()?;
         let (done, total, lit) = (AtomicUsize::new(0), plans.len(), Lit::default());
@@ -393,15 +392,13 @@ struct Plan<'a> {
 }
 
 impl<'a> Plan<'a> {
-    /// `listed` are the images of the capture.
     fn new(
         capture: &Capture,
-        listed: &HashSet<&Path>,
         view: &'a View,
         LoadOptions { downscale, distances, mask_as_alpha, .. }: LoadOptions<'_>,
     ) -> Result<Self> {
         let Some(path) = &view.image else { return Err(Error::file(&view.name, "does not exist")) };
-        let (path, downscale) = made_smaller(&capture.folder, listed, path, downscale);
+        let (path, downscale) = made_smaller(&capture.folder, path, downscale);
         let header = Header::read(&path)?;
         let size = fitting(&header, &path, &view.camera)?;
         let to = size.map(|side| ((side as f64 / downscale as f64).round() as usize).max(1));
@@ -514,8 +511,8 @@ pub(super) fn open(path: &Path, camera: &Camera) -> Result<Photo> {
 }
 
 /// The image in a folder of downscaled images, such as `images_4` beside `images`, with the remaining factor; otherwise
-/// the image itself. `listed` are the images of the capture.
-fn made_smaller(folder: &Path, listed: &HashSet<&Path>, path: &Path, downscale: usize) -> (PathBuf, usize) {
+/// the image itself.
+fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize) {
     let inside = path.strip_prefix(folder).unwrap_or(Path::new(""));
     // The capture itself refers to downscaled images.
     let factor = formats::factor_of(inside);
@@ -528,9 +525,8 @@ fn made_smaller(folder: &Path, listed: &HashSet<&Path>, path: &Path, downscale: 
         return (path.to_owned(), downscale);
     }
     let other = folder.join(format!("images_{downscale}")).join(parts.as_path());
-    // Another image of the capture with that name has a copy of its own.
-    let is_own = |ending: &&str| !listed.contains(&*path.with_extension(ending));
-    let endings = ["png", "jpg", "JPG", "jpeg", "webp"].into_iter().filter(is_own);
+    // An image of that name has a copy of its own.
+    let endings = ["png", "jpg", "JPG", "jpeg", "webp"].into_iter().filter(|end| !path.with_extension(end).is_file());
     let endings: Vec<PathBuf> = endings.map(|ending| other.with_extension(ending)).collect();
     let found = [other].into_iter().chain(endings).find(|path| path.is_file());
     found.map_or_else(|| (path.to_owned(), downscale), |path| (path, 1))
