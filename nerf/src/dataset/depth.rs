@@ -67,16 +67,19 @@ fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
     Ok((size, values))
 }
 
-/// The values of an image with several channels whose pixels are grey; 0 where it is transparent. `None` if it has
-/// colours.
+/// The values of an image with several channels whose pixels are grey; 0 where it is transparent, unless it is so
+/// everywhere. `None` if it has colours.
 fn grey(image: &DynamicImage) -> Option<Vec<f64>> {
     fn values<T: Copy + Into<f64>>(values: &[T], channels: usize) -> Option<Vec<f64>> {
-        let pixel = |pixel: &[T]| {
-            let (colors, alpha) = pixel.split_at(channels - usize::from(channels.is_multiple_of(2)));
-            let value = colors[0].into();
-            let is_grey = colors.iter().all(|color| (*color).into() == value);
-            let is_clear = alpha.iter().any(|alpha| (*alpha).into() == 0.0);
-            (is_grey || is_clear).then_some(if is_clear { 0.0 } else { value })
+        let split = |pixel| <[T]>::split_at(pixel, channels - usize::from(channels.is_multiple_of(2)));
+        let is_clear = |pixel| split(pixel).1.iter().any(|alpha| (*alpha).into() == 0.0);
+        // Some programs leave alpha at 0.
+        let has_alpha = !values.chunks_exact(channels).all(is_clear);
+        let pixel = |pixel| {
+            let (is_hidden, [first, others @ ..]) = (has_alpha && is_clear(pixel), split(pixel).0) else { return None };
+            let value = (*first).into();
+            let is_grey = others.iter().all(|color| (*color).into() == value);
+            (is_grey || is_hidden).then_some(if is_hidden { 0.0 } else { value })
         };
         values.chunks_exact(channels).map(pixel).collect()
     }
@@ -286,8 +289,12 @@ mod tests {
         ImageBuffer::<Rgba<u16>, _>::from_fn(3, 2, with_alpha).save(&path).unwrap();
         let hidden: Vec<f64> = (0..6).map(|i| if i % 3 == 1 { 0.0 } else { expected[i] }).collect();
         assert_eq!(decoded(&path).unwrap().1, hidden, "nothing is measured where it is transparent");
-        ImageBuffer::<LumaA<u8>, _>::from_fn(3, 2, |x, _| LumaA([x as u8, 255])).save(&path).unwrap();
-        assert_eq!(decoded(&path).unwrap().1, [0.0, 1.0, 2.0, 0.0, 1.0, 2.0]);
+        for alpha in [255, 0] {
+            ImageBuffer::<LumaA<u8>, _>::from_fn(3, 2, |x, _| LumaA([x as u8, alpha])).save(&path).unwrap();
+            assert_eq!(decoded(&path).unwrap().1, [0.0, 1.0, 2.0, 0.0, 1.0, 2.0], "alpha {alpha}");
+        }
+        ImageBuffer::<Rgba<u8>, _>::from_pixel(3, 2, Rgba([1, 2, 3, 0])).save(&path).unwrap();
+        assert!(decoded(&path).unwrap_err().to_string().contains("has colours"));
     }
 
     #[test]

@@ -207,8 +207,8 @@ impl Photo {
         /// The least opaque share of the border, and the least transparent share of the image.
         const WHOLE: [f64; 2] = [0.98, 0.05];
         /// The same where an object touches the border: of the border, and of the middle half of both sides. A cut-out
-        /// object that reaches over an edge covers less of the border, or else the middle.
-        const TOUCHED: [f64; 2] = [0.75, 0.5];
+        /// object that reaches over its edges covers less of the border, or more of the middle.
+        const TOUCHED: [f64; 2] = [0.9, 0.4];
         if !self.has_alpha() {
             return false;
         }

@@ -28,8 +28,8 @@ const EXPORTS: [(&str, &str, &str); 23] = [
     ("cameras.sfm", "a scene of Meshroom", "convert it with `aliceVision_exportColmap`"),
     ("bundle.out", "a reconstruction of Bundler", "write its cameras as transforms.json"),
     ("train/pose", "a dataset of NeRF++", "write its matrices as transforms.json"),
-    ("traj.txt", "a sequence of Replica", "write its matrices as transforms.json"),
-    ("groundtruth.txt", "a sequence of TUM RGB-D", "write its poses as transforms.json"),
+    ("results/frame000000.jpg", "a sequence of Replica", "write its matrices as transforms.json"),
+    ("rgb.txt", "a sequence of TUM RGB-D", "write its poses as transforms.json"),
     ("cfg_args", "an output of 3D Gaussian Splatting", "name the capture that its `source_path` names"),
     ("dataparser_transforms.json", "a run of nerfstudio", "name the capture that it was trained on"),
     ("database.db", "a COLMAP project without a model", "run COLMAP's mapper, or `raygrad prepare` on the images"),
@@ -230,15 +230,22 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
     let model = below(path, &capture.file);
     if matches!(capture.format, Format::Colmap | Format::Transforms) && capture.present().next().is_none() {
         let around = Description::new(capture.format, path, capture.file.clone()).read(needed)?;
-        let first = around.present().next().and_then(|view| Some(below(path, view.image.as_ref()?)));
+        // Images farther below may be those of other captures.
+        let is_near = |view: &&View| {
+            let inside = view.image.as_ref().and_then(|image| image.strip_prefix(path).ok());
+            inside.is_some_and(|inside| inside.components().count() <= 2 || inside == Path::new(&view.name))
+        };
+        let first = around.present().find(|view| capture.format == Format::Colmap || is_near(view));
+        let first = first.and_then(|view| Some(below(path, view.image.as_ref()?)));
         // Undistorted models have images of their own.
         let is_pinhole = |view: &View| view.camera.lens == Lens::Pinhole;
         let is_undistorted = capture.format == Format::Colmap && around.views.iter().all(is_pinhole);
         match first {
             Some(image) if is_undistorted => {
                 let what = format!(
-                    "has no image beside it, and may have undistorted images of its own: copy those there or, to use \
-                     others, such as `{image}`, move the model to `sparse/0`"
+                    "has no images, and may have undistorted ones of its own: copy those to `{}` or, to use others, such \
+                     as `{image}`, move the model to `sparse/0`",
+                    below(path, &capture.folder.join("images"))
                 );
                 return Err(Error::file(&capture.file, what));
             }

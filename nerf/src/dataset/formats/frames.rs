@@ -1,6 +1,6 @@
 //! The frames of a JSON file as views.
 
-use super::intrinsics::{check_known, check_lengths};
+use super::intrinsics::check_known;
 use super::json::{Object, first_of, unused};
 use super::layers::Layers;
 use super::locate::{Located, locate};
@@ -108,7 +108,7 @@ impl Frames {
             check_known(frame)?;
             let angle_y = dialect == Dialect::Transforms;
             let pose = matrix::pose(frame, "transform_matrix")?;
-            let pose = pose.and_then(|pose| check_lengths(frame, angle_y).map(|()| pose));
+            let pose = pose.and_then(|pose| layers[i].check_lengths(angle_y).map(|()| pose));
             let mut pose = match pose {
                 Ok(pose) => pose,
                 Err(error) => {

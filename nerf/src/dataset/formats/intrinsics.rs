@@ -42,6 +42,9 @@ const MATRICES: [&str; 6] = ["K", "intrinsics", "camera_intrinsics", "intrinsic_
 /// Names of a focal length that may be in millimetres, and of a field of view that may be in degrees.
 const UNCLEAR: [&str; 8] = ["focal_length", "focal", "fov", "fovx", "fov_x", "FovX", "hfov", "field_of_view"];
 
+/// What is wrong with a matrix with another entry than a finite number.
+const NOT_FINITE: &str = "must have finite numbers";
+
 /// The least focal length of other names than instant-ngp's, as a share of the image's side: some are in units of the
 /// side.
 const SHORTEST: f64 = 0.05;
@@ -100,32 +103,13 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     Err(object.error(name, format!("is {}, which raygrad does not read: {what}", shown(value))))
 }
 
-/// Checks that a frame's own principal point is finite, and its focal lengths or fields of view above 0. Those of images
-/// without a pose are not, in some files.
-///
-/// # Errors
-/// If one is not.
-pub(super) fn check_lengths(frame: &Object<'_>, angle_y: bool) -> Result<()> {
-    for name in ["cx", "cy"] {
-        if frame.get(name).and_then(number).is_some_and(|x| !x.is_finite()) {
-            frame.number(name)?;
-        }
-    }
-    let vertical = ["fl_y", "fy", if angle_y { "camera_angle_y" } else { "fl_y" }];
-    for names in [["fl_x", "fx", "camera_angle_x"], vertical] {
-        // Only the first counts.
-        let Some(name) = names.into_iter().find(|name| frame.get(name).is_some()) else { continue };
-        if frame.get(name).and_then(number).is_some() {
-            frame.positive(name)?;
-        }
-    }
-    let matrices = MATRICES.into_iter().filter_map(|name| Some((name, frame.get(name)?)));
-    for (name, value) in matrices {
-        if let Some(what) = entries_of(value).and_then(|entries| unusable(&entries)) {
-            return Err(frame.error(name, format!("{what}, is {}", shown(value))));
-        }
-    }
-    Ok(())
+/// The first [intrinsic matrix](MATRICES) of an object, with its name and its entries. Values of other shapes belong to
+/// other programs.
+fn matrix_of<'a>(object: &'a Object<'_>) -> Option<(&'static str, &'a Value, Vec<&'a Value>)> {
+    MATRICES.into_iter().find_map(|name| {
+        let value = object.get(name)?;
+        Some((name, value, entries_of(value)?))
+    })
 }
 
 /// What is wrong with an [intrinsic matrix](MATRICES) that some programs write for images without a camera.
@@ -137,13 +121,49 @@ fn unusable(entries: &[&Value]) -> Option<&'static str> {
     };
     let is_lost = |value: &&Value| value.is_null() || number(value).is_some_and(|x| !x.is_finite());
     if entries.iter().any(is_lost) {
-        return Some("must have finite numbers");
+        return Some(NOT_FINITE);
     }
     let is_no_length = |i: usize| number(entries[i]).is_some_and(|f| f <= 0.0);
     [0, second].into_iter().any(is_no_length).then_some("must have focal lengths above 0")
 }
 
 impl Layers<'_, '_> {
+    /// Checks that the frame's own principal point is finite, and its focal lengths or fields of view above 0, as far as
+    /// they count. Those of images without a pose are not, in some files.
+    ///
+    /// # Errors
+    /// If one is not.
+    pub(super) fn check_lengths(&self, angle_y: bool) -> Result<()> {
+        let frame = self.frame;
+        for name in ["cx", "cy"] {
+            if frame.get(name).and_then(number).is_some_and(|x| !x.is_finite()) {
+                frame.number(name)?;
+            }
+        }
+        // Panoramas have no focal length.
+        if lens::read(self).is_ok_and(|lens| lens == Lens::Equirectangular) {
+            return Ok(());
+        }
+        let matrix = matrix_of(frame);
+        if let Some((name, value, entries)) = &matrix
+            && let Some(what) = unusable(entries)
+        {
+            return Err(frame.error(name, format!("{what}, is {}", shown(value))));
+        }
+        let has_own = ["fl_x", "fl_y"].iter().any(|name| frame.get(name).is_some());
+        for [own, other, angle] in [["fl_x", "fx", "camera_angle_x"], ["fl_y", "fy", "camera_angle_y"]] {
+            // The first counts, as in `focal_of`.
+            let other = (!has_own).then_some(other);
+            let angle = (angle_y || angle == "camera_angle_x").then_some(angle);
+            let others = other.into_iter().chain(angle).filter(|_| matrix.is_none());
+            let name = [own].into_iter().chain(others).find(|name| frame.get(name).is_some());
+            if let Some(name) = name.filter(|name| frame.get(name).and_then(number).is_some()) {
+                frame.positive(name)?;
+            }
+        }
+        Ok(())
+    }
+
     /// Reads a side of the image, in pixels. BlenderNeRF writes fractions, which Blender and nerfstudio drop.
     fn side(&self, name: &str) -> Result<Option<usize>> {
         match self.number(name)? {
@@ -260,8 +280,11 @@ impl Layers<'_, '_> {
 
     /// True if the frame has the file's focal length, and none gives the size of its image.
     pub(super) fn is_focal_alone(&self, camera: &Camera, angle_y: bool) -> Result<bool> {
+        if camera.lens == Lens::Equirectangular {
+            return Ok(false);
+        }
         let own = focal_of(self.frame, [camera.width, camera.height], angle_y)?;
-        Ok(own == [None; 2] && self.size()?.is_none() && camera.lens != Lens::Equirectangular)
+        Ok(own == [None; 2] && self.size()?.is_none())
     }
 
     /// A note on a field of view that contradicts the focal length of `camera`, which counts, as in other programs.
@@ -333,7 +356,11 @@ fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Opt
         let Some(a) = object.number(angle)? else { return Ok(None) };
         let f = focal_length(side, a);
         if !(a > 0.0 && a < PI) || (side > 0 && unfit_focal(f).is_some()) {
-            let advice = if a > PI { ": multiply degrees by pi / 180" } else { "" };
+            let advice = match a {
+                _ if a > 2.001 * PI => ": multiply degrees by pi / 180",
+                _ if a >= PI => ": give the `camera_model` and the focal length of a wider lens",
+                _ => "",
+            };
             return Err(object.error(angle, format!("must be an angle in radians between 0 and pi, is {a}{advice}")));
         }
         Ok(Some(f))
@@ -372,14 +399,12 @@ struct OtherNames {
 
 impl OtherNames {
     fn of(object: &Object<'_>) -> Result<Self> {
-        for name in MATRICES {
-            // Values of other shapes belong to other programs.
-            let Some((value, entries)) = object.get(name).and_then(|value| Some((value, entries_of(value)?))) else {
-                continue;
-            };
+        if let Some((name, value, entries)) = matrix_of(object) {
             let m: Option<Vec<f64>> = entries.iter().map(|x| number(x)).collect();
-            let m = unusable(&entries).map_or_else(|| m.ok_or("must have finite numbers"), Err);
-            let lengths = m.and_then(|m| lengths(&m, value.is_object()));
+            let lengths = match (unusable(&entries), m) {
+                (None, Some(m)) => lengths(&m, value.is_object()),
+                (what, _) => Err(what.unwrap_or(NOT_FINITE)),
+            };
             let lengths = lengths.map_err(|what| object.error(name, format!("{what}, is {}", shown(value))))?;
             return Ok(OtherNames { name, lengths: lengths.map(Some) });
         }

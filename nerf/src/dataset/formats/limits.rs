@@ -11,7 +11,7 @@ const FOCAL: RangeInclusive<f64> = 1e-3..=1e9;
 /// What is wrong with a focal length in pixels.
 pub(super) fn unfit_focal(focal: f64) -> Option<String> {
     let is_fit = FOCAL.contains(&focal);
-    (!is_fit).then(|| format!("must be a focal length in pixels, 1e-3 to 1e9, is {focal}"))
+    (!is_fit).then(|| format!("must be 1e-3 to 1e9 pixels, is {focal}"))
 }
 
 /// What is wrong with a coordinate of the principal point of an image with this side. Crops may lie beside the point, but

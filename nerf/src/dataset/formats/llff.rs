@@ -182,7 +182,7 @@ fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, Option<[f64; 2]>
     };
     let (width, height) = (pixels("width", width)?, pixels("height", height)?);
     if let Some(what) = unfit_focal(focal) {
-        return Err(format!("column 14 {what}"));
+        return Err(format!("focal length {what}"));
     }
     let bounds = Some([row[15], row[16]]).filter(|[near, far]| *near > 0.0 && far > near && *far <= MOST_RATIO * near);
     let centre = [0.5 * width as f64, 0.5 * height as f64];

@@ -290,11 +290,9 @@ fn points(reader: &mut impl BufRead) -> Result<Points> {
     }
     let Element { count, properties, .. } = &header.vertex;
     let (mut points, mut colors) = (Points::of(*count), vec![]);
-    let mut is_whole = true;
     for i in 0..*count {
         if let Err(what) = header.entry(reader, properties, &mut values) {
             points.end(format!("ends after {i} of {count} vertices ({what}): copy it again"));
-            is_whole = false;
             break;
         }
         let [error, views] = others.map(|other| other.map_or(0.0, |other| values[other]));
@@ -305,7 +303,7 @@ fn points(reader: &mut impl BufRead) -> Result<Points> {
             colors.extend(color.map(|color| color.map(|at| value(at) as f32)));
         }
     }
-    if is_whole && header.is_last && header.has_more(reader) {
+    if header.is_last && header.has_more(reader) {
         points.follow(format!("more data follow the last of {count} vertices: correct the count, or copy it again"));
     }
     let most = colors.iter().flatten().copied().fold(0.0, f32::max);

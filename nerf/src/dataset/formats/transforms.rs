@@ -66,7 +66,8 @@ pub(super) fn read_file(folder: &Path, file: &Path, needed: bool) -> Result<Capt
     let mut capture = Capture { aabb_scale, applied, assumptions, ..capture };
     if let Some(path) = points {
         // The points are in the coordinates of the file: nerfstudio transforms them together with the cameras.
-        let file = folder.join(path);
+        let beside = file.with_file_name(&path);
+        let file = if beside.exists() { beside } else { folder.join(path) };
         ply::read(&file).attach(&mut capture, &file);
     }
     Ok(capture)

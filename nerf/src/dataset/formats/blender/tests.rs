@@ -53,6 +53,12 @@ fn images_and_cameras_are_read() {
 }
 
 #[test]
+fn vertical_angles_are_those_of_the_sensor() {
+    let capture = good(|d| d["frames"][1]["camera_angle_y"] = json!(0));
+    assert_eq!(capture.views.len(), 2, "{:?}", capture.assumptions);
+}
+
+#[test]
 fn blender_splits_are_all_read() {
     let folder = folder(|d| d["aabb_scale"] = json!(2));
     let file = |split: &str, text: String| std::fs::write(folder.path().join(format!("transforms_{split}.json")), text);

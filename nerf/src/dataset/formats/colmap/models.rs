@@ -3,7 +3,7 @@
 use super::super::models::{MODELS, Model, coefficient, least};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
-use crate::dataset::formats::limits::{MOST_PIXELS, start, unfit_centre, unfit_focal};
+use crate::dataset::formats::limits::{MOST_PIXELS, start, unfit_focal};
 use glam::DAffine3;
 use std::f64::consts::PI;
 
@@ -76,11 +76,6 @@ pub(super) fn camera(
         lens => lens,
     };
     let centre = ["cx", "cy"].map(or_zero);
-    for (name, x, side) in [("cx", centre[0], width), ("cy", centre[1], height)] {
-        if let Some(what) = unfit_centre(x, side) {
-            return Err((name, what));
-        }
-    }
     Ok(Camera { width, height, focal, centre, lens: simplest(lens), pose: DAffine3::IDENTITY })
 }
 

@@ -243,9 +243,9 @@ fn captures_are_found_in_unusual_places() {
         let folder = moved(Format::Colmap, &files.each_ref().map(|[from, to]| (from.as_str(), to.as_str())));
         let path = folder.path();
         let message = read(path, None).unwrap_err().to_string();
-        let expected =
-            "has no image beside it, and may have undistorted images of its own: copy those there or, to use";
-        assert!(message.contains(&format!("{place}/sparse/images.bin: {expected}")), "{message}");
+        let expected = "has no images, and may have undistorted ones of its own: copy those to";
+        let expected = format!("{place}/sparse/images.bin: {expected} `{place}/images` or, to use");
+        assert!(message.contains(&expected), "{message}");
         assert!(message.ends_with("others, such as `images/0.png`, move the model to `sparse/0`"), "{message}");
         std::fs::rename(path.join("images"), path.join(place).join("images")).unwrap();
         check(&folder, &format!("{place}/sparse/images.bin"), place);
@@ -301,8 +301,15 @@ fn captures_are_found_in_unusual_places() {
             let text = std::fs::read_to_string(path.join(&file)).unwrap();
             std::fs::write(path.join(&file), text.replace("images/", "")).unwrap();
         }
+        // Points are beside the file.
+        let text = std::fs::read_to_string(path.join(&file)).unwrap();
+        let text = text.replacen('{', "{\"ply_file_path\": \"points.ply\",", 1);
+        std::fs::write(path.join(&file), text).unwrap();
+        let points = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
+                      end_header\n1 2 3\n";
+        std::fs::write(path.join(place).join("points.ply"), points).unwrap();
         let capture = read(path, None).unwrap();
-        assert_eq!((capture.present().count(), &*capture.folder), (3, path), "{file}");
+        assert_eq!((capture.present().count(), capture.points.len(), &*capture.folder), (3, 1, path), "{file}");
         let note = format!("no images are beside `{file}`: used others, such as `{images}/0.png`");
         assert_eq!(capture.assumptions.last(), Some(&note));
         assert_eq!(read_file(path, &path.join(&file), true).unwrap().present().count(), 3, "as a run keeps it");
@@ -310,6 +317,13 @@ fn captures_are_found_in_unusual_places() {
         kit::picture(&path.join(place).join(if images == "images" { "images/0.png" } else { "0.png" }), 8, 6);
         assert_eq!(read(path, None).unwrap().present().count(), 1);
     }
+    // Images farther below may be those of another capture, unless the file has their paths.
+    let folder = moved(Format::Transforms, &[("transforms.json", "a/transforms.json"), ("images", "b/images")]);
+    assert_eq!(read(folder.path(), None).unwrap().present().count(), 0);
+    let file = folder.path().join("a/transforms.json");
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::write(file, text.replace("images/", "b/images/")).unwrap();
+    assert_eq!(read(folder.path(), None).unwrap().present().count(), 3);
     // Usual places come first.
     let folder = moved(Format::Transforms, &[("transforms.json", "old/transforms.json"), ("images", "old/images")]);
     write(folder.path(), Format::Llff, [1, 1], 0);

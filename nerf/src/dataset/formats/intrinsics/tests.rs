@@ -380,8 +380,8 @@ fn invalid_camera_numbers_are_named() {
         assert_eq!([camera.width, camera.height], [side, 200], "a fraction is dropped");
     }
     for value in [json!(0), json!(-100), json!(1e-9), json!(1e300)] {
-        fails(|d| d["fl_x"] = value.clone(), &["`fl_x`: must be a focal length"]);
-        fails(|d| d["fl_y"] = value, &["`fl_y`: must be a focal length"]);
+        fails(|d| d["fl_x"] = value.clone(), &["`fl_x`: must be 1e-3 to 1e9 pixels"]);
+        fails(|d| d["fl_y"] = value, &["`fl_y`: must be 1e-3 to 1e9 pixels"]);
     }
     for angle in [json!(0), json!(-0.5), json!(3.2), json!(PI), json!(1e-300)] {
         let change = |d: &mut Value| {
@@ -397,6 +397,14 @@ fn invalid_camera_numbers_are_named() {
         },
         &["`camera_angle_x`: must be an angle in radians between 0 and pi, is 39.6: multiply degrees by pi / 180"],
     );
+    // A panorama, and a fisheye lens of 220 degrees.
+    for angle in [json!(2.0 * PI), json!(3.84)] {
+        let change = |d: &mut Value| {
+            remove(d, "fl_x");
+            d["camera_angle_x"] = angle;
+        };
+        fails(change, &["`camera_angle_x`: ", "give the `camera_model` and the focal length of a wider lens"]);
+    }
     fails(|d| d["cx"] = json!(1e12), &["`cx`: must be a position in pixels"]);
     fails(|d| remove(d, "h"), &["`h`: is missing beside `w`"]);
     fails(|d| remove(d, "w"), &["`w`: is missing beside `h`"]);

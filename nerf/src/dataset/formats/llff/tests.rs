@@ -90,7 +90,7 @@ fn llff_errors_name_the_row() {
     fails(2, 1.002, "its first three columns (down, right, backwards): must be a rotation, but its columns are not");
     fails(4, 0.4, "height must be 1 to");
     fails(9, 1e300, "width must be 1 to");
-    fails(14, 0.0, "column 14 must be a focal length in pixels, 1e-3 to 1e9, is 0");
+    fails(14, 0.0, "focal length must be 1e-3 to 1e9 pixels, is 0");
     fails_as(&npy(&ROWS[..1]), "`shape`: has 1 rows, but there are 2 images");
     fails_as(&npy(&[]), "`shape`: has no rows: add one per image");
     fails_as(&Matrix { rows: 2, columns: 15, values: vec![0.0; 30] }.write(), "`shape`: must have 17 columns, has 15");

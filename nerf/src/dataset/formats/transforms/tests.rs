@@ -141,10 +141,20 @@ fn frames_without_a_pose_are_left_out() {
     ] {
         check(good(|d| d["frames"][1][field] = value), why);
     }
-    // A length of another name that does not count.
-    for (own, other) in [("fl_x", "fx"), ("fl_x", "camera_angle_x"), ("fl_y", "camera_angle_y")] {
-        let both = |d: &mut Value| (d["frames"][1][own], d["frames"][1][other]) = (json!(12), json!(0));
-        assert_eq!(good(both).views.len(), 3, "{own} beside {other}");
+    // Lengths that do not count.
+    let matrix = json!([[9, 0, 4], [0, 9, 3], [0, 0, 1]]);
+    for fields in [
+        json!({ "fl_x": 12, "fx": 0 }),
+        json!({ "fl_x": 12, "fy": 0 }),
+        json!({ "fl_x": 12, "camera_angle_x": 0 }),
+        json!({ "fl_y": 12, "camera_angle_y": 0 }),
+        json!({ "K": matrix, "fx": 0 }),
+        json!({ "K": matrix, "camera_angle_x": 0 }),
+        json!({ "K": matrix, "cam_K": ([[0; 3]; 3]) }),
+        json!({ "camera_model": "EQUIRECTANGULAR", "fl_x": 4, "fx": 0, "K": ([[0; 3]; 3]) }),
+    ] {
+        let with = |d: &mut Value| d["frames"][1].as_object_mut().unwrap().extend(fields.as_object().unwrap().clone());
+        assert_eq!(good(with).views.len(), 3, "{fields}");
     }
     // Most frames must have one, and other values are mistakes.
     let most = |field: &'static str, value: Value| {

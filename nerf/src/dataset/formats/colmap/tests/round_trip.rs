@@ -129,7 +129,7 @@ fn unwritable_colmap_captures_are_named() {
     };
     camera(&|c| c.lens = Lens::Fov { omega: 4.0 }, "camera`: omega: must be below pi (radians)");
     camera(&|c| c.lens = Lens::Brown { k: [f64::NAN; 6], p: [0.0; 2] }, "camera`: k1: must be a finite number");
-    camera(&|c| c.focal[1] = 0.0, "camera`: focal length: must be a focal length in pixels");
+    camera(&|c| c.focal[1] = 0.0, "camera`: focal length: must be 1e-3 to 1e9 pixels");
     camera(&|c| c.centre[0] = f64::INFINITY, "camera`: cx: must be a finite number");
     camera(&|c| c.width = 0, "camera`: width: must be 1 to");
     camera(&|c| c.pose.matrix3 *= 1.01, "pose`: must be a rotation");
