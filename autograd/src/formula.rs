@@ -197,11 +197,14 @@ impl<T: Scalar, F: Formula<N>, const N: usize> Op<T> for Elementwise<F, N> {
         let readings = self.readings();
         if cx.recording() {
             let reads = Op::<T>::reads_for(self, &|i| cx.needs(i));
-            let has_operands = !reads.output() || (0..N).all(|i| reads.input(i));
-            let is_fusible = has_operands && N < 3 && readings.iter().all(|reading| reading.of != 0);
-            let has_far_operand = || (0..N).any(|i| reads.input(i) && has_far(cx.x(i).value()));
-            if is_fusible && (has_far(cx.g().value()) || has_far_operand()) {
-                return fused_gradients(cx, *self, reads);
+            // f64 has no wider type for the derivatives.
+            if const { size_of::<T>() == size_of::<f32>() } {
+                let has_operands = !reads.output() || (0..N).all(|i| reads.input(i));
+                let is_fusible = has_operands && N < 3 && readings.iter().all(|reading| reading.of != 0);
+                let has_far_operand = || (0..N).any(|i| reads.input(i) && has_far(cx.x(i).value()));
+                if is_fusible && (has_far(cx.g().value()) || has_far_operand()) {
+                    return fused_gradients(cx, *self, reads);
+                }
             }
             let sheet = Sheet::new();
             let (g, x, y) = given(cx, &sheet, reads);
