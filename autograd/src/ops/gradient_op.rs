@@ -74,10 +74,11 @@ impl<T: Scalar, O: FusedGradient<T> + FusedGradient<f64>> Op<T> for GradientOp<O
     }
 }
 
-/// Whether an element is far from 1, so that ordinary products in f32 of it and some others may leave the range: above
-/// 2^30, or below 2^-63 and not 0.
+/// Whether an element is far from 1, so that ordinary products of it and some others may leave the range: above 2^30, or
+/// below 2^-63 and not 0. In f64, above 2^300 or below 2^-300.
 pub(crate) fn has_far<T: Scalar>(x: &Tensor<T>) -> bool {
-    let [least, most] = [-63, 30].map(|exponent| T::from_f64(power_of_two(exponent)));
+    let ends = if size_of::<T>() == 4 { [-63, 30] } else { [-300, 300] };
+    let [least, most] = ends.map(|exponent| T::from_f64(power_of_two(exponent)));
     let has = |values: &[T]| {
         simd::dispatch(
             #[inline(always)]
