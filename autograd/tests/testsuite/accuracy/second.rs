@@ -221,3 +221,22 @@ fn second_derivatives_of_all_bits() {
     let failed = check::<f32>(setting("ACCURACY_SECONDS").unwrap_or(1500));
     assert!(failed.is_empty(), "beyond {LIMIT} units in the last place:\n{}", failed.join("\n"));
 }
+
+/// The operands' shapes differ, and their numbers are so far from 1 that the recorded gradient is one operation.
+#[test]
+fn second_derivatives_of_broadcast_operands_are_summed() {
+    let tape = Tape::<f32>::new();
+    let a = tape.leaf(Tensor::from([[2e12], [3e12]]));
+    let b = tape.leaf(Tensor::from([1.0, 2.0, 4.0]));
+    let first = (&a / &b).sum().grad_graph(&[&a, &b]);
+    let check = |what: &str, got: &Tensor<f32>, expected: &Tensor<f32>| {
+        assert_eq!(got.shape(), expected.shape(), "{what}");
+        let both = got.as_slice().iter().zip(expected.as_slice());
+        assert!(both.into_iter().all(|(x, y)| (x - y).abs() <= 1e-6 * y.abs()), "{what}: {got:?}, not {expected:?}");
+    };
+    check("by a", first[0].value(), &Tensor::from([[1.75], [1.75]]));
+    check("by b", first[1].value(), &Tensor::from([-5e12, -1.25e12, -3.125e11]));
+    let second = first[1].sum().grad(&[&a, &b]);
+    check("by b and a", &second[0], &Tensor::from([[-1.3125], [-1.3125]]));
+    check("by b twice", &second[1], &Tensor::from([1e13, 1.25e12, 1.5625e11]));
+}
