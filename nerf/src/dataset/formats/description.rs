@@ -231,11 +231,12 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
     if matches!(capture.format, Format::Colmap | Format::Transforms) && capture.present().next().is_none() {
         let around = Description::new(capture.format, path, capture.file.clone()).read(needed)?;
         // Images farther below may be those of other captures.
-        let is_near = |view: &&View| {
+        let is_near = |view: &View| {
             let inside = view.image.as_ref().and_then(|image| image.strip_prefix(path).ok());
             inside.is_some_and(|inside| inside.components().count() <= 2 || inside == Path::new(&view.name))
         };
-        let first = around.present().find(|view| capture.format == Format::Colmap || is_near(view));
+        let is_own = capture.format == Format::Colmap || around.present().all(is_near);
+        let first = around.present().next().filter(|_| is_own);
         let first = first.and_then(|view| Some(below(path, view.image.as_ref()?)));
         // Undistorted models have images of their own.
         let is_pinhole = |view: &View| view.camera.lens == Lens::Pinhole;
