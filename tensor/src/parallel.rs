@@ -230,7 +230,7 @@ mod tests {
             write(&[outer * inner], &|y| extremum(wide, middle, true, y));
         }
         write(&tall, &|y| rows::softmax_rows(wide, 517, y, &pool));
-        write(&tall, &|y| rows::softmax_rows_grad(wide, wide, 517, y));
+        write(&tall, &|y| rows::softmax_rows_grad(wide, wide, wide, 517, y));
         write(&tall, &|y| rows::log_softmax_rows(wide, 517, y, &pool));
         write(&tall, &|y| rows::log_softmax_rows_grad(wide, wide, 517, y, &pool));
         write(&[1031], &|y| rows::logsumexp_rows(wide, 517, y, &pool));

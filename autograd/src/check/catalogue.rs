@@ -246,7 +246,7 @@ fn reductions() -> Vec<Entry> {
             .sample(&[&[2, 0], &[0], &[0]]),
         layer_norm_grad(0),
         layer_norm_grad(1),
-        Entry::new(softmax::SOFTMAX_GRAD).sample(&[&[2, 5], &[2, 5]]).sample(&[&[0, 3], &[0, 3]]),
+        Entry::new(softmax::SOFTMAX_GRAD).sample(&[&[2, 5], &[2, 5], &[2, 5]]).sample(&[&[0, 3], &[0, 3], &[0, 3]]),
         Entry::new(GradientOp { op: softmax::LogSoftmax, input: 0 }).sample(&[&[2, 5], &[2, 5]]).sample(&[&[3], &[3]]),
         Entry::new(GradientOp { op: product::Product, input: 0 })
             .sample(&[&[2, 4], &[2]])

@@ -70,11 +70,11 @@ impl<T: Scalar> Op<T> for Softmax {
     }
 
     fn reads(&self) -> Reads {
-        Reads::OUTPUT
+        Reads::ALL
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(cx.tape().apply(SOFTMAX_GRAD, &[&cx.y(), cx.g()]))
+        Grads::one(cx.tape().apply(SOFTMAX_GRAD, &[&cx.x(0), &cx.y(), cx.g()]))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
@@ -83,19 +83,24 @@ impl<T: Scalar> Op<T> for Softmax {
     }
 }
 
-/// The gradient of the softmax as an operation of the *output* and its gradient.
+/// The gradient of the softmax as an operation of its input, its *output* and the gradient of that.
 pub(crate) const SOFTMAX_GRAD: GradientOp<Softmax> = GradientOp { op: Softmax, input: 0 };
 
 impl<T: Scalar> FusedGradient<T> for Softmax {
     const GRADIENT: &'static str = "softmax_grad";
 
-    fn gradient(&self, _input: usize, y: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
-        by_rows(y[0], pool, |y, n, out| rows::softmax_rows_grad(y, g.as_slice(), n, out))
+    fn gradient(&self, _input: usize, x: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        by_rows(x[0], pool, |x0, n, out| rows::softmax_rows_grad(x0, x[1].as_slice(), g.as_slice(), n, out))
     }
 
-    fn recorded<'t>(&self, _input: usize, y: &[Var<'t, T>], g: &Var<'t, T>) -> Option<Var<'t, T>> {
-        let y = &y[0];
-        Some(in_range(g, |g| y * (g - (g * y).sum_over(kept_last()))))
+    fn recorded<'t>(&self, _input: usize, x: &[Var<'t, T>], g: &Var<'t, T>) -> Option<Var<'t, T>> {
+        let (x, y) = (&x[0], &x[1]);
+        let least = T::from_f64(power_of_two(if size_of::<T>() == 4 { -126 } else { -1022 }));
+        let lifts = y.value().iter().any(|y| y < least) && g.value().iter().any(|g| g.abs() > T::ONE);
+        Some(in_range(g, |g| match lifts {
+            true => softmax_times(x, &(g - softmax_times(x, g).sum_over(kept_last()))),
+            false => y * (g - (g * y).sum_over(kept_last())),
+        }))
     }
 }
 

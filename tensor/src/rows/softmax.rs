@@ -86,16 +86,26 @@ fn ln_total<T: Scalar>(powers: &[T]) -> T {
     (rest + (ones - T::ONE)).ln1p()
 }
 
+/// The smallest normal number.
+#[inline(always)]
+fn least_normal<T: Scalar>() -> T {
+    T::from_f64(power_of_two(if size_of::<T>() == 4 { -126 } else { -1022 }))
+}
+
 /// Whether `factor` times a power of a row may be in range although the power is not.
 #[inline(always)]
 fn lifts<T: Scalar>(factor: T, powers: &[T]) -> bool {
-    if factor.abs() <= T::ONE {
-        return false;
-    }
-    bottom(powers) < T::from_f64(power_of_two(if size_of::<T>() == 4 { -126 } else { -1022 }))
+    factor.abs() > T::ONE && bottom(powers) < least_normal()
 }
 
-/// `out = e^(x - shift) * factor`, where the power may underflow and the factor brings it back.
+/// `e^(x - shift) * factor`, where the power may underflow and the factor brings it back.
+#[inline(always)]
+fn large_multiple<T: Scalar>(x: T, shift: T, factor: T) -> T {
+    let root = (T::from_f64(0.5) * (x - shift)).exp();
+    corrected(root * factor * root, x, shift)
+}
+
+/// `out = e^(x - shift) * factor`, where powers may underflow.
 #[cold]
 #[inline(never)]
 fn large_multiples<T: Scalar>(x: &[T], shift: T, factor: T, out: &mut [T]) {
@@ -103,8 +113,7 @@ fn large_multiples<T: Scalar>(x: &[T], shift: T, factor: T, out: &mut [T]) {
         #[inline(always)]
         || {
             for (out, &x) in out.iter_mut().zip(x) {
-                let root = (T::from_f64(0.5) * (x - shift)).exp();
-                *out = corrected(root * factor * root, x, shift);
+                *out = large_multiple(x, shift, factor);
             }
         },
     );
@@ -180,49 +189,59 @@ pub fn softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>)
     );
 }
 
-/// The gradient of softmax of a row where `sum g y`, or a difference from it, may be out of range.
+/// The gradient of softmax of a row where a probability has underflowed, or `sum g y` or a difference from it may be out
+/// of range.
 #[cold]
 #[inline(never)]
-fn large_softmax_grad<T: Scalar>(y: &[T], g: &[T], out: &mut [T]) {
-    let [down, up] = [0.25, 4.0].map(T::from_f64);
-    let [mean] = totals_of(y, g, |y, g| [y * (g * down)]);
-    for i in 0..y.len() {
-        out[i] = y[i] * (g[i] * down - mean) * up;
-    }
+fn large_softmax_grad<T: Scalar>(x: &[T], g: &[T], out: &mut [T]) {
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            let [down, up] = [0.25, 4.0].map(T::from_f64);
+            let greatest = top(x);
+            let [sum] = totals_of(x, x, |x, _| [large_multiple(x, greatest, T::ONE)]);
+            let scale = T::ONE / sum;
+            let [mean] = totals_of(x, g, |x, g| [large_multiple(x, greatest, g * down * scale)]);
+            for i in 0..x.len() {
+                out[i] = large_multiple(x[i], greatest, (g[i] * down - mean) * scale) * up;
+            }
+        },
+    );
 }
 
-/// The gradient of softmax from its output: `y (g - sum g y)` in each row. A probability that has underflowed counts as
-/// 0, also where a large `g` would bring it back into range.
+/// The gradient of softmax from its output `y`: `y (g - sum g y)` in each row. The input `x` counts where a probability
+/// has underflowed and a large `g` brings it back into range.
 ///
 /// # Panics
-/// If `y` is not whole rows of `n`, or `g` or `out` is shorter than `y`.
+/// If `x` is not whole rows of `n`, or `y`, `g` or `out` is shorter than `x`.
 #[track_caller]
-pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
-    check_whole(y.len(), n);
-    if y.is_empty() {
+pub fn softmax_rows_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], n: usize, out: &mut [T]) {
+    check_whole(x.len(), n);
+    if x.is_empty() {
         return;
     }
     // Up to this size, no difference from a mean overflows.
     let largest_mean = T::from_f64(power_of_two(if size_of::<T>() == 4 { 100 } else { 960 }));
-    blocks(&mut out[..y.len()], n, 0, &Pool::none(), &|_, start, out| {
+    blocks(&mut out[..x.len()], n, 0, &Pool::none(), &|_, start, out| {
         let len = out.len();
-        let (y, g) = (&y[start..][..len], &g[start..][..len]);
+        let [x, y, g] = [x, y, g].map(|x| &x[start..][..len]);
         simd::dispatch(
             #[inline(always)]
             || {
-                for ((y, g), out) in y.chunks_exact(n).zip(g.chunks_exact(n)).zip(out.chunks_exact_mut(n)) {
+                for (i, out) in out.chunks_exact_mut(n).enumerate() {
+                    let [x, y, g] = [x, y, g].map(|x| &x[i * n..][..n]);
                     let [mean] = totals_of(
                         y,
                         g,
                         #[inline(always)]
                         |y, g| [y * g],
                     );
-                    if mean.abs() <= largest_mean {
-                        for i in 0..n {
-                            out[i] = y[i] * (g[i] - mean);
-                        }
-                    } else {
-                        large_softmax_grad(y, g, out);
+                    if lifts(top(g), y) || lifts(bottom(g), y) || !(mean.abs() <= largest_mean) {
+                        large_softmax_grad(x, g, out);
+                        continue;
+                    }
+                    for i in 0..n {
+                        out[i] = y[i] * (g[i] - mean);
                     }
                 }
             },
@@ -423,7 +442,7 @@ mod tests {
             logsumexp_rows(&x, n, &mut ln, &pool);
             assert_close(&ln, sums.iter().map(|sum| sum.ln()), 1e-6);
             let g: Vec<f32> = matrix(rows, n).into_iter().rev().collect();
-            softmax_rows_grad(&y, &g, n, &mut all);
+            softmax_rows_grad(&x, &y, &g, n, &mut all);
             let wide = |i: usize| f64::from(y[i]) * f64::from(g[i]);
             let inner = |i: usize| (i / n * n..i / n * n + n).map(wide).sum::<f64>();
             assert_close(&all, (0..x.len()).map(|i| wide(i) - f64::from(y[i]) * inner(i)), 1e-3);
@@ -475,11 +494,11 @@ mod tests {
         let (pool, x) = (Pool::<f32>::none(), [0.0; 7]);
         // The last number belonged to no row, and its result was whatever stood there.
         assert_panics(|| softmax_rows(&x, 3, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 3");
-        assert_panics(|| softmax_rows_grad(&x, &x, 3, &mut [0.0; 7]), "7 numbers are not whole rows of 3");
+        assert_panics(|| softmax_rows_grad(&x, &x, &x, 3, &mut [0.0; 7]), "7 numbers are not whole rows of 3");
         assert_panics(|| log_softmax_rows(&x, 3, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 3");
         assert_panics(|| log_softmax_rows_grad(&x, &x, 3, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 3");
         assert_panics(|| softmax_rows(&x, 0, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 0");
-        assert_panics(|| softmax_rows_grad(&x, &x, 0, &mut [0.0; 7]), "7 numbers are not whole rows of 0");
+        assert_panics(|| softmax_rows_grad(&x, &x, &x, 0, &mut [0.0; 7]), "7 numbers are not whole rows of 0");
         assert_panics(|| log_softmax_rows(&x, 0, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 0");
         assert_panics(|| log_softmax_rows_grad(&x, &x, 0, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 0");
         assert_panics(|| logsumexp_rows(&x, 3, &mut [0.0; 2], &pool), "7 numbers are not 2 rows of 3");

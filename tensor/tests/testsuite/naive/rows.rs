@@ -47,7 +47,7 @@ fn softmaxes<T: Scalar>() {
         // Gradients, of what the kernels are given.
         let wide_y = wide(&y);
         let mut dx = nan::<T>(x.len());
-        softmax_rows_grad(&y, &g, n, &mut dx);
+        softmax_rows_grad(&x, &y, &g, n, &mut dx);
         let means = by_row(&|i| wide_y[i] * wide_g[i]);
         let exact = (0..x.len()).map(|i| wide_y[i] * (wide_g[i] - means[i / n]));
         close(&what("gradient of softmax"), &dx, 24.0, exact.zip(&wide_y).map(|(d, y)| [d, 4.0 * y]));
