@@ -224,6 +224,8 @@ fn reductions() -> Vec<Entry> {
         Entry::new(scan::CumprodGrad(walk(0, true))).sample(&[&[4], &[4]]),
         Entry::new(scan::Recurrence(walk(0, false))).sample(&[&[5], &[5]]).sample(&[&[4, 2], &[4, 2]]),
         Entry::new(scan::Recurrence(walk(1, true))).sample(&[&[2, 4], &[2, 4]]).sample(&[&[2, 0], &[2, 0]]),
+        Entry::new(GradientOp { op: scan::Recurrence(walk(0, false)), input: 0 }).sample(&[&[4, 2], &[4, 2], &[4, 2]]),
+        Entry::new(GradientOp { op: scan::Recurrence(walk(1, true)), input: 0 }).sample(&[&[2, 4], &[2, 4], &[2, 4]]),
         Entry::new(product::Product)
             .sample(&[&[2, 4]])
             .sample_of(zeros(&[3, 4], 5))

@@ -179,7 +179,7 @@ impl<'t, T: Scalar> Var<'t, T> {
 
 #[cfg(test)]
 mod tests {
-    use crate::{Tape, Tensor};
+    use crate::{Scalar, Tape, Tensor};
 
     #[test]
     fn comparisons_broadcast_and_nan_equals_nothing() {
@@ -226,5 +226,22 @@ mod tests {
         let (a, b) = (tape.leaf(Tensor::scalar(1e8)), tape.leaf(Tensor::scalar(0.1)));
         assert_eq!(a.lerp(&b, 1.0).item(), 0.1);
         assert_eq!(a.lerp(&b, 0.0).item(), 1e8);
+    }
+
+    #[test]
+    fn interpolation_between_ends_whose_difference_overflows() {
+        fn check<T: Scalar>(most: f64) {
+            let tape = Tape::<T>::new();
+            let [a, b, w] = [most, -most, 0.25].map(|x| tape.leaf(Tensor::scalar(T::from_f64(x))));
+            let y = a.lerp(&b, &w);
+            assert_eq!(y.item(), T::from_f64(0.5 * most));
+            assert_eq!((y * 0.25).grad(&[&w])[0].item(), T::from_f64(-0.5 * most));
+        }
+        check::<f32>(f32::MAX.into());
+        check::<f64>(f64::MAX);
+        // The unit of the smallest numbers is kept where it does not.
+        let tape = Tape::<f64>::new();
+        let [a, b] = [0.0, 5e-324].map(|x| tape.leaf(Tensor::scalar(x)));
+        assert_eq!(a.lerp(&b, 1.0).item(), 5e-324);
     }
 }

@@ -918,6 +918,24 @@ fn softmax_and_its_relatives_for_extreme_logits_and_gradients() {
     assert!((grad.value().as_slice()[0] / expected - 1.0).abs() < 1e-13, "{grad:?}");
 }
 
+/// In f64, which has no wider type for the derivatives of a gradient.
+#[test]
+fn second_derivatives_of_softmax_for_large_gradients() {
+    fn second(x: &[f64], g: &[f64], f: Function<f64>) -> f64 {
+        let tape = Tape::new();
+        let leaf = tape.leaf(Tensor::from_vec(&[x.len()], x.to_vec()));
+        let first = f(&leaf).vjp(&tape.constant(Tensor::from_vec(&[g.len()], g.to_vec())), &[&leaf]).remove(0);
+        (first.slice_axis(0, ..1) * 1e-300).sum().grad(&[&leaf])[0].as_slice()[0]
+    }
+    let (most, scaled) = (f64::MAX, 1e-300 * f64::MAX);
+    // p (1 - p) (1 - 2 p) times a difference that is out of range, and -p (1 - p) times a sum that is.
+    let softmax = second(&[0.01_f64.ln(), 0.99_f64.ln()], &[most, -most], |x| x.softmax(-1));
+    let log_softmax = second(&[0.0; 3], &[most / 2.0; 3], |x| x.log_softmax(-1));
+    for (got, expected) in [(softmax, 0.0099 * 0.98 * 2.0 * scaled), (log_softmax, -2.0 / 9.0 * 1.5 * scaled)] {
+        assert!((got / expected - 1.0).abs() < 1e-13, "{got:e} for {expected:e}");
+    }
+}
+
 #[test]
 fn products_and_lengths_at_the_ends_of_the_range() {
     let tape = Tape::<f64>::new();
