@@ -430,8 +430,8 @@ impl<T: Scalar> Op<T> for Recurrence {
         let (tape, a, g) = (cx.tape(), cx.x(0), cx.g());
         let db = tape.apply(Recurrence(self.0.back()), &[&self.0.neighbour(&a, true, 0.0), g]);
         let da = cx.needs(0).then(|| {
-            // A factor of the product may have been rounded out of the range.
-            if has_far(db.value()) || has_far(cx.y().value()) {
+            // A factor of the product may have been rounded out of the range, and be 0.
+            if has_far(a.value()) || has_far(db.value()) || has_far(cx.y().value()) {
                 tape.apply(GradientOp { op: *self, input: 0 }, &[&a, &cx.x(1), g])
             } else {
                 &db * self.0.neighbour(&cx.y(), false, 0.0)

@@ -946,6 +946,11 @@ fn products_and_lengths_at_the_ends_of_the_range() {
     let x = tape.leaf(Tensor::from([1.0, power(230), power(-230)]));
     let g = tape.constant(Tensor::from([0.0, 0.0, power(-900)]));
     assert_eq!((x.cumprod(0) * g).sum().grad(&[&x])[0].as_slice()[0], power(-900));
+    // A gradient that is 0 after rounding, times a sum that brings it back.
+    let a = tape.leaf(Tensor::from([1.0, 1.0, power(-960)]));
+    let y = a.recurrence(&tape.constant(Tensor::from([power(170), 1.0, 1.0])), 0);
+    let g = tape.constant(Tensor::from([0.0, 0.0, power(-160)]));
+    assert_eq!((y * g).sum().grad(&[&a])[0].as_slice()[1], power(-950));
     let [a, b] = [f64::INFINITY, f64::NEG_INFINITY].map(|x| tape.leaf(Tensor::scalar(x)));
     assert_eq!((a.hypot(&b).item(), a.hypot(&a).item()), (f64::INFINITY, f64::INFINITY));
     let nan = tape.leaf(Tensor::scalar(f64::NAN));
