@@ -92,7 +92,7 @@ macro_rules! functions_of {
                 if y < 0.25 { (-e).mul_add(y, e) } else { y }
             }
 
-            /// The distribution function of the standard normal distribution, within 5 ULP.
+            /// The distribution function of the standard normal distribution, within 6 ULP.
             #[inline(always)]
             pub fn normal_cdf(x: $t) -> $t {
                 Wide::normal_cdf(x).narrow()

@@ -88,7 +88,7 @@ macro_rules! wide {
 
                 #[inline(always)]
                 fn normal_cdf(x: $t) -> Self {
-                    // Close to 0, (1 + erf(x / sqrt 2)) / 2. Beyond, the tail is P(-t) = e^(-t^2/2) p(u) / (t + 5), with
+                    // Up to 1.3, (1 + erf(x / sqrt 2)) / 2. Beyond, the tail is P(-t) = e^(-t^2/2) p(u) / (t + 5), with
                     // u = (t - 5) / (t + 5).
                     let t = clamp(x.abs(), 0.0, 70.0);
                     let inverse = 1.0 / (t + 5.0);
@@ -98,8 +98,8 @@ macro_rules! wide {
                     let density = Self::exp(square, half.mul_add(x, -square));
                     let tail = Wide { mantissa: density.mantissa * ratio, exponent: density.exponent };
                     let near = erf_near(x * FRAC_1_SQRT_2).mul_add(0.5, 0.5);
-                    let above = if t < 0.7 { near } else { 1.0 - tail.narrow() };
-                    let is_tail = x <= -0.7;
+                    let above = if t < 1.3 { near } else { 1.0 - tail.narrow() };
+                    let is_tail = x <= -1.3;
                     Wide {
                         mantissa: if is_tail { tail.mantissa } else { above },
                         exponent: if is_tail { tail.exponent } else { 0.0 },

@@ -322,7 +322,7 @@ fn gate(name: &str, is_gradient: bool) -> f64 {
         _ if is_gradient => GATE,
         name if ROUNDED.contains(&name) => 0.5,
         name if FUNCTIONS.contains(&name) => 2.0,
-        "normal_cdf" => 5.0,
+        "normal_cdf" => 6.0,
         _ => GATE,
     }
 }

@@ -66,18 +66,18 @@ fn examine(single: &Operation<f32>, double: &Operation<f64>, cases: Range<u64>) 
             x.iter_mut().zip(drawn).for_each(|(x, drawn)| x.push(drawn));
         }
     }
-    let slopes = evaluate(double, constants, x.clone(), vec![1.0; n]);
-    let slopes: Vec<&[f64]> = slopes[1..].iter().map(|slopes| slopes.as_slice()).collect();
+    // The value and the slopes in f64.
+    let references = evaluate(double, constants, x.clone(), vec![1.0; n]);
+    let references: Vec<&[f64]> = references.iter().map(|reference| reference.as_slice()).collect();
     let mut g = Vec::with_capacity(n);
     for i in 0..n {
-        g.push(incoming(&mut random, slopes[i / 2 % operands][i]));
+        g.push(incoming(&mut random, references[1 + i / 2 % operands][i]));
     }
     let narrow = |x: &[f64]| x.iter().map(|&x| x as f32).collect::<Vec<_>>();
     let results = evaluate(single, constants, x.iter().map(|x| narrow(x)).collect(), narrow(&g));
-    let references = evaluate(double, constants, x.clone(), g.clone());
     let values = results[0].as_slice();
     let column = |k: usize| {
-        let (results, references) = (results[k].as_slice(), references[k].as_slice());
+        let (results, references) = (results[k].as_slice(), references[k]);
         let (mut column, mut worst, gate) = (Column::default(), None, gate(single.name, k > 0));
         let x = |i: usize| x.iter().map(|x| x[i]).collect::<Vec<_>>();
         let mut add = |i: usize| {
@@ -92,7 +92,7 @@ fn examine(single: &Operation<f32>, double: &Operation<f64>, cases: Range<u64>) 
             if k > 0 && !values[i].is_finite() {
                 continue;
             }
-            let error = quick_error(got.into(), reference);
+            let error = quick_error(got.into(), if k > 0 { g[i] * reference } else { reference });
             // Both may be NaN for no reason.
             let is_lost = got.is_nan() && !x(i).iter().any(|x| x.is_nan());
             if is_lost || !(error < 0.99 * gate) {

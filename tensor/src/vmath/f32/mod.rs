@@ -1,5 +1,5 @@
 //! Single precision: at most 1 ULP for `exp`, `exp2` and `ln`, and 2 ULP for the others, over all 2^32 arguments.
-//! `sinh`, `cosh` and `hypot` are within 2 ULP on samples, `normal_cdf` within 5. Functions that
+//! `sinh`, `cosh` and `hypot` are within 2 ULP on samples, `normal_cdf` within 6. Functions that
 //! [call the standard library](super) have no bound here.
 
 mod erf;

@@ -1,4 +1,4 @@
-//! Double precision: at most 2 ULP, measured on large samples; `normal_cdf` 5 ULP. The functions work as those in
+//! Double precision: at most 2 ULP, measured on large samples; `normal_cdf` 6 ULP. The functions work as those in
 //! single precision.
 
 mod erf;
