@@ -4,9 +4,10 @@ use super::softmax::softmax_times;
 use crate::cases::INF;
 use crate::error::ensure;
 use crate::slopes::{checked, product_over, scaled_difference, softplus_slope, within};
-use crate::{Axes, Cases, Formula, Grads, Op, Operand, ShapeError, Var, Vjp};
+use crate::{Axes, Cases, Formula, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
-use raygrad_tensor::{Indices, Mask, Pool, Real, Scalar, Shape, Tensor};
+use raygrad_tensor::scale::power_of_two;
+use raygrad_tensor::{Indices, Mask, Pool, Real, Scalar, Shape, Tensor, mean_to};
 use std::sync::Arc;
 
 /// y = (a - b)^2; da = 2 g (a - b), db = -da.
@@ -222,15 +223,78 @@ impl<T: Scalar> Op<T> for CrossEntropy {
     }
 }
 
-/// The mean of `loss`. Where that is out of range, it is the mean of `scaled(up)`, which is `loss / up`, times `up`: a
-/// power of two of at least the number of elements.
+/// y = the mean of the elements of a loss, given these and its operands; the gradient of an element is g / n. Where that
+/// is a subnormal number, which has lost digits, the gradients of the operands follow from a multiple of it.
+#[derive(Clone, Copy)]
+pub struct MeanLoss<F>(pub F);
+
+impl<T: Scalar, F: Formula<2>> Op<T> for MeanLoss<F> {
+    fn name(&self) -> &'static str {
+        "mean_loss"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[1..].iter().all(|operand| operand == &x[0]) { Ok(Shape::new()) } else { Err("the shapes differ".into()) }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        mean_to(x[0], &[], pool)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::only(&[1, 2])
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (g, shape) = (cx.g(), cx.shape(0));
+        let n = shape.iter().product::<usize>() as f64;
+        let [least, up] = if size_of::<T>() == 4 { [-126, 100] } else { [-1022, 900] }.map(power_of_two);
+        let share = g / n;
+        if g.item() == T::ZERO || !(share.item().abs() < T::from_f64(least)) {
+            return Grads::new([Some(share.broadcast_to(shape)), None, None]);
+        }
+        // Of variables on the same tape, or on one of its own.
+        let [a, b] = [1, 2].map(|i| cx.x(i));
+        let [da, db] = if cx.recording() {
+            gradients(self.0, [&a.tracked(), &b.tracked()], g.clone(), [up, n])
+        } else {
+            let tape = cx.tape().nested();
+            let [a, b] = [a, b].map(|x| tape.leaf(x.value().clone()));
+            let grads = gradients(self.0, [&a, &b], tape.constant(g.value().clone()), [up, n]);
+            grads.map(|grad| cx.constant(grad.into_value()))
+        };
+        Grads::new([None, Some(da), Some(db)])
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        Some(x[0].mean())
+    }
+}
+
+/// The gradients of the operands of a mean of `n` losses, from `up` times the gradient of each.
+fn gradients<'t, T: Scalar, F: Formula<2>>(
+    loss: F,
+    x: [&Var<'t, T>; 2],
+    g: Var<'t, T>,
+    [up, n]: [f64; 2],
+) -> [Var<'t, T>; 2] {
+    let y = loss.on(x);
+    let g = (g * up / n).broadcast_to(y.shape());
+    let mut grads = y.vjp(&g, &x).into_iter().map(|grad| grad / up);
+    [(); 2].map(|()| match grads.next() {
+        Some(grad) => grad,
+        None => unreachable!("a gradient of each operand"),
+    })
+}
+
+/// `mean`, a mean of `n` losses. Where that is out of range, it is the mean of `scaled(up)`, which is the loss divided by
+/// `up`, times `up`: a power of two of at least `n`.
 #[track_caller]
-fn mean_in_range<'t, T: Scalar>(loss: Var<'t, T>, scaled: impl FnOnce(f64) -> Var<'t, T>) -> Var<'t, T> {
-    let mean = loss.mean();
+fn in_range<'t, T: Scalar>(mean: Var<'t, T>, n: usize, scaled: impl FnOnce(f64) -> Var<'t, T>) -> Var<'t, T> {
     if mean.item().is_finite() {
         return mean;
     }
-    let up = loss.value().len().next_power_of_two() as f64;
+    let up = n.next_power_of_two() as f64;
     scaled(up).mean() * up
 }
 
@@ -242,6 +306,13 @@ impl<'t, T: Scalar> Var<'t, T> {
         let same = ensure(self.shape() == target.shape(), || "prediction and target have different shapes".into());
         self.tape().fits(F::NAME, &[self, &target], same);
         loss.on([self, &target])
+    }
+
+    /// The mean of a loss of each element.
+    #[track_caller]
+    fn mean_loss<F: Formula<2>>(&self, loss: F, target: &Self) -> Self {
+        let losses = self.loss(loss, target);
+        self.tape().apply(MeanLoss(loss), &[&losses, self, target])
     }
 
     /// The squared error of each element, `(self - target)^2`.
@@ -264,7 +335,7 @@ impl<'t, T: Scalar> Var<'t, T> {
             let r = self - &target;
             &r * (&r / up)
         };
-        mean_in_range(self.squared_error(&target), scaled)
+        in_range(self.mean_loss(SquaredError, &target), self.value().len(), scaled)
     }
 
     /// The absolute error of each element, `|self - target|`. The gradient at equality is 0.
@@ -283,7 +354,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn l1_loss(&self, target: impl Operand<'t, T>) -> Self {
         let target = target.on(self.tape());
-        mean_in_range(self.absolute_error(&target), |up| (self / up - &target / up).abs())
+        let scaled = |up: f64| (self / up - &target / up).abs();
+        in_range(self.mean_loss(AbsoluteError, &target), self.value().len(), scaled)
     }
 
     /// The Huber loss of each element. With `r = self - target` it is `r^2 / 2` for `|r| <= delta`, and
@@ -293,8 +365,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ or `delta` is not positive.
     #[track_caller]
     pub fn huber(&self, target: impl Operand<'t, T>, delta: f64) -> Self {
+        self.loss(self.huber_of(delta), target)
+    }
+
+    #[track_caller]
+    fn huber_of(&self, delta: f64) -> Huber {
         self.fits("huber", ensure(delta > 0.0, || format!("delta is {delta}; it must be above 0")));
-        self.loss(Huber { delta }, target)
+        Huber { delta }
     }
 
     /// The mean of [`huber`](Self::huber), as a scalar.
@@ -304,7 +381,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn huber_loss(&self, target: impl Operand<'t, T>, delta: f64) -> Self {
         let target = target.on(self.tape());
-        mean_in_range(self.huber(&target, delta), |up| self.scaled_huber(&target, delta, up) * delta)
+        let scaled = |up: f64| self.scaled_huber(&target, delta, up) * delta;
+        in_range(self.mean_loss(self.huber_of(delta), &target), self.value().len(), scaled)
     }
 
     /// `smooth_l1 / up` for a `beta` above 0, with the division before the difference.
@@ -323,8 +401,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ or `beta` is negative.
     #[track_caller]
     pub fn smooth_l1(&self, target: impl Operand<'t, T>, beta: f64) -> Self {
+        self.loss(self.smooth_l1_of(beta), target)
+    }
+
+    #[track_caller]
+    fn smooth_l1_of(&self, beta: f64) -> SmoothL1 {
         self.fits("smooth_l1", ensure(beta >= 0.0, || format!("beta is {beta}; it must be at least 0")));
-        self.loss(SmoothL1 { beta }, target)
+        SmoothL1 { beta }
     }
 
     /// The mean of [`smooth_l1`](Self::smooth_l1), as a scalar.
@@ -338,7 +421,7 @@ impl<'t, T: Scalar> Var<'t, T> {
             true => (self / up - &target / up).abs(),
             false => self.scaled_huber(&target, beta, up),
         };
-        mean_in_range(self.smooth_l1(&target, beta), scaled)
+        in_range(self.mean_loss(self.smooth_l1_of(beta), &target), self.value().len(), scaled)
     }
 
     /// The binary cross-entropy of each element, from logits: `-t ln s - (1 - t) ln(1 - s)`. Here `s` is the
@@ -358,7 +441,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ.
     #[track_caller]
     pub fn binary_cross_entropy_with_logits_loss(&self, target: impl Operand<'t, T>) -> Self {
-        self.binary_cross_entropy_with_logits(target).mean()
+        self.mean_loss(BinaryCrossEntropy, &target.on(self.tape()))
     }
 
     /// The cross-entropy of each row of logits, `-ln softmax(row)[class]`: `[.., n]` to `[..]`. `classes` has one class
@@ -394,7 +477,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     pub fn cross_entropy_loss(&self, classes: impl Into<Indices>) -> Self {
         let classes = classes.into();
         let loss = self.cross_entropy(classes.clone());
-        mean_in_range(loss.clone(), |up| {
+        in_range(loss.mean(), loss.value().len(), |up| {
             // The logarithm of a row and the logit are in range where their difference is not.
             let shape = loss.shape();
             let mut column = Shape::from_slice(shape);

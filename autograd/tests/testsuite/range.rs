@@ -791,6 +791,50 @@ fn mean_losses_beyond_the_range() {
 }
 
 /// Means of windows, and of gradients of windows that share a pixel, of numbers whose sum is out of range.
+/// The gradient of each element of a loss is a subnormal number, or 0 after rounding, and its product is not.
+#[test]
+fn gradients_of_mean_losses_from_subnormal_shares() {
+    fn check<T: Scalar>(g: f64, residual: f64) {
+        let n = 7;
+        let tape = Tape::<T>::new();
+        let [r, g] = [residual, g].map(T::from_f64);
+        let x = tape.leaf(Tensor::full(&[n], r));
+        let zero = tape.leaf(Tensor::zeros(&[n]));
+        let (slope, g_wide) = (r.to_f64(), g.to_f64());
+        let losses = [
+            ("mse", x.mse_loss(&zero), 2.0 * slope),
+            ("huber", x.huber_loss(&zero, residual * 2.0), slope),
+            ("smooth_l1", x.smooth_l1_loss(&zero, residual), 1.0),
+            ("l1", x.l1_loss(&zero), 1.0),
+        ];
+        for (name, loss, slope) in losses {
+            let g = tape.constant(Tensor::scalar(g));
+            let plain = tape.no_grad(|| loss.vjp(&g, &[&x, &zero]));
+            let recorded = loss.vjp(&g, &[&x, &zero]);
+            for (grads, sign) in [(&plain, 1.0), (&plain, -1.0), (&recorded, 1.0), (&recorded, -1.0)] {
+                let grad = &grads[usize::from(sign < 0.0)];
+                // One rounding of a subnormal result.
+                let least = if T::NAME == "f32" { 1e-45 } else { 5e-324 };
+                for got in grad.value().iter() {
+                    let expected = sign * (g_wide * 1e30 / n as f64 * slope) / 1e30;
+                    let error = (got.to_f64() - expected).abs();
+                    assert!(
+                        error <= (4.0 * T::EPSILON * expected.abs()).max(least),
+                        "{name}: {got:?} for {expected:e}"
+                    );
+                }
+            }
+        }
+        let loss = x.binary_cross_entropy_with_logits_loss(&zero);
+        let grad = tape.no_grad(|| loss.vjp(&tape.constant(Tensor::scalar(g)), &[&zero])).remove(0);
+        let expected = -g_wide * slope / n as f64;
+        assert!((grad.value().as_slice()[0].to_f64() / expected - 1.0).abs() <= 4.0 * T::EPSILON, "{grad:?}");
+    }
+    check::<f32>(1e-43, 1e15);
+    check::<f32>(-1e-45, 1e18);
+    check::<f64>(1e-322, 1e30);
+}
+
 #[test]
 fn pooled_means_at_the_end_of_the_range() {
     fn check<T: Scalar>(most: T) {
