@@ -40,6 +40,9 @@ pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image
     Ok(out)
 }
 
+/// What is wrong with depths in EXR. The remedy for images would encode them as colours.
+const NOT_DECODED: &str = "is EXR, which raygrad does not decode: write depths as PNG of 16 bits or as .npy";
+
 /// The width, height and row-major values of a depth file.
 fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
     let wrong = |what: String| Error::file(path, what);
@@ -49,7 +52,7 @@ fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
         return Ok(([columns, rows], values));
     }
     if bytes.starts_with(EXR) {
-        return Err(wrong("is EXR, which raygrad does not decode: write depths as PNG of 16 bits or as .npy".into()));
+        return Err(wrong(NOT_DECODED.into()));
     }
     let (decoder, _) = decoder_of(Cursor::new(&bytes), bytes.len() as u64, path)?;
     let decoded = DynamicImage::from_decoder(decoder);
@@ -121,6 +124,9 @@ impl Depths {
             // The file, and 8 bytes for each of its 4.
             return Ok(file.metadata().map_err(bad)?.len().saturating_mul(3));
         }
+        if start.starts_with(EXR) {
+            return Err(Error::file(path, NOT_DECODED));
+        }
         let header = Header::read(path)?;
         let [width, height] = header.sizes[0];
         Ok(header.decoding + 8 * (width * height) as u64)
@@ -185,6 +191,19 @@ mod tests {
     use super::*;
     use glam::{DAffine3, DVec3};
     use image::{LumaA, Rgb, Rgba};
+
+    /// The remedy for images is wrong for depths: it clips them and applies a curve.
+    #[test]
+    fn exr_depths_have_their_own_remedy() {
+        let file = tempfile::Builder::new().suffix(".exr").tempfile().unwrap();
+        std::fs::write(file.path(), [EXR, &[0; 60]].concat()).unwrap();
+        let camera = Camera::from_angle(5, 3, 1.4, DAffine3::IDENTITY);
+        let [one, other] =
+            [Depths::decoding_memory(file.path()).map(drop), distances(file.path(), 1.0, &camera).map(drop)];
+        for message in [one, other].map(|result| result.unwrap_err().to_string()) {
+            assert!(message.ends_with(NOT_DECODED) && !message.contains("ffmpeg"), "{message}");
+        }
+    }
 
     #[test]
     fn depth_files_round_trip() {

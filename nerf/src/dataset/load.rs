@@ -398,9 +398,7 @@ impl<'a> Plan<'a> {
         LoadOptions { downscale, distances, mask_as_alpha, .. }: LoadOptions<'_>,
     ) -> Result<Self> {
         let Some(path) = &view.image else { return Err(Error::file(&view.name, "does not exist")) };
-        let (path, downscale) = made_smaller(&capture.folder, path, downscale);
-        let header = Header::read(&path)?;
-        let size = fitting(&header, &path, &view.camera)?;
+        let (path, header, size, downscale) = made_smaller(&capture.folder, path, &view.camera, downscale)?;
         let to = size.map(|side| ((side as f64 / downscale as f64).round() as usize).max(1));
         let is_cut = mask_as_alpha && view.has_cutout();
         if mask_as_alpha && !is_cut && header.channels == 3 {
@@ -510,26 +508,44 @@ pub(super) fn open(path: &Path, camera: &Camera) -> Result<Photo> {
     Photo::open(path, Some(size_for(path, camera)?))
 }
 
-/// The image in a folder of downscaled images, such as `images_4` beside `images`, with the remaining factor; otherwise
-/// the image itself.
-fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize) {
+/// The image in a folder of downscaled images, such as `images_4` beside `images`, if it has that size, with the
+/// remaining factor; otherwise the image itself. Also its header, and its size in the orientation of its camera.
+fn made_smaller(
+    folder: &Path,
+    path: &Path,
+    camera: &Camera,
+    downscale: usize,
+) -> Result<(PathBuf, Header, [usize; 2], usize)> {
+    let header = Header::read(path)?;
+    let size = fitting(&header, path, camera)?;
     let inside = path.strip_prefix(folder).unwrap_or(Path::new(""));
     // The capture itself refers to downscaled images.
     let factor = formats::factor_of(inside);
     if factor > 1 {
-        return (path.to_owned(), downscale.div_ceil(factor));
+        return Ok((path.to_owned(), header, size, downscale.div_ceil(factor)));
     }
+    let other = (downscale > 1).then(|| smaller_copy(folder, path, inside, downscale)).flatten();
+    let fits = |copy: PathBuf| {
+        let header = Header::read(&copy).ok()?;
+        let own = fitting(&header, &copy, camera).ok()?;
+        let is_of_factor = |i: usize| own[i].abs_diff(size[i] / downscale) <= 1 + size[i] / downscale / 32;
+        (is_of_factor(0) && is_of_factor(1)).then_some((copy, header, own, 1))
+    };
+    Ok(other.and_then(fits).unwrap_or_else(|| (path.to_owned(), header, size, downscale)))
+}
+
+/// The copy of an image `inside` a folder that is downscaled by this factor.
+fn smaller_copy(folder: &Path, path: &Path, inside: &Path, downscale: usize) -> Option<PathBuf> {
     let mut parts = inside.components();
     let first = parts.next().and_then(|part| part.as_os_str().to_str()).unwrap_or("");
-    if downscale == 1 || first != "images" {
-        return (path.to_owned(), downscale);
+    if first != "images" {
+        return None;
     }
     let other = folder.join(format!("images_{downscale}")).join(parts.as_path());
     // An image of that name has a copy of its own.
     let endings = ["png", "jpg", "JPG", "jpeg", "webp"].into_iter().filter(|end| !path.with_extension(end).is_file());
     let endings: Vec<PathBuf> = endings.map(|ending| other.with_extension(ending)).collect();
-    let found = [other].into_iter().chain(endings).find(|path| path.is_file());
-    found.map_or_else(|| (path.to_owned(), downscale), |path| (path, 1))
+    [other].into_iter().chain(endings).find(|path| path.is_file())
 }
 
 /// Returns true if the aspect ratios of an image and a camera agree, up to the rounding of a side. ffmpeg, and so

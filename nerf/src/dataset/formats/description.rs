@@ -211,7 +211,10 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
                 format!("describes a capture in the format {}, not {asked}", description.format),
             ));
         }
-        return description.read(needed);
+        let capture = description.read(needed)?;
+        let is_alone = description.format == Format::Transforms;
+        let around = description.folder.parent().filter(|_| is_alone).unwrap_or(&description.folder);
+        return with_images_around(around, capture, needed);
     }
     let mut all = descriptions(path);
     let is_usual = !all.is_empty();
@@ -226,38 +229,48 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
         return most_complete(&all, needed);
     }
     check_single(path, &all)?;
-    let mut capture = most_complete(&all, needed)?;
+    let capture = most_complete(&all, needed)?;
     let model = below(path, &capture.file);
-    if matches!(capture.format, Format::Colmap | Format::Transforms) && capture.present().next().is_none() {
-        let around = Description::new(capture.format, path, capture.file.clone()).read(needed)?;
+    let mut capture = with_images_around(path, capture, needed)?;
+    capture.assumptions.insert(0, format!("the usual places hold no capture: used `{model}`"));
+    Ok(capture)
+}
+
+/// The capture with images in the folders around its own, up to `top`, if it has no images itself.
+///
+/// # Errors
+/// If it is a COLMAP model that may have images of its own, or as the format's own `read`.
+fn with_images_around(top: &Path, capture: Capture, needed: bool) -> Result<Capture> {
+    let may_be = matches!(capture.format, Format::Colmap | Format::Transforms);
+    if !may_be || capture.present().next().is_some() {
+        return Ok(capture);
+    }
+    let roots = capture.folder.ancestors().skip(1).take_while(|root| root.starts_with(top));
+    for root in roots.map(Path::to_owned).collect::<Vec<_>>() {
+        let around = Description::new(capture.format, &root, capture.file.clone()).read(needed)?;
         // Images farther below may be those of other captures.
         let is_near = |view: &View| {
-            let inside = view.image.as_ref().and_then(|image| image.strip_prefix(path).ok());
+            let inside = view.image.as_ref().and_then(|image| image.strip_prefix(&root).ok());
             inside.is_some_and(|inside| inside.components().count() <= 2 || inside == Path::new(&view.name))
         };
         let is_own = capture.format == Format::Colmap || around.present().all(is_near);
         let first = around.present().next().filter(|_| is_own);
-        let first = first.and_then(|view| Some(below(path, view.image.as_ref()?)));
+        let Some(image) = first.and_then(|view| Some(below(top, view.image.as_ref()?))) else { continue };
         // Undistorted models have images of their own.
         let is_pinhole = |view: &View| view.camera.lens == Lens::Pinhole;
-        let is_undistorted = capture.format == Format::Colmap && around.views.iter().all(is_pinhole);
-        match first {
-            Some(image) if is_undistorted => {
-                let what = format!(
-                    "has no images, and may have undistorted ones of its own: copy those to `{}` or, to use others, such \
-                     as `{image}`, move the model to `sparse/0`",
-                    below(path, &capture.folder.join("images"))
-                );
-                return Err(Error::file(&capture.file, what));
-            }
-            Some(image) => {
-                capture = around;
-                capture.assumptions.push(format!("no images are beside `{model}`: used others, such as `{image}`"));
-            }
-            None => {}
+        if capture.format == Format::Colmap && around.views.iter().all(is_pinhole) {
+            let what = format!(
+                "has no images, and may have undistorted ones of its own: copy those to `{}` or, to use others, such \
+                 as `{image}`, move the model to `sparse/0`",
+                below(top, &capture.folder.join("images"))
+            );
+            return Err(Error::file(&capture.file, what));
         }
+        let mut around = around;
+        let file = below(top, &capture.file);
+        around.assumptions.push(format!("no images are beside `{file}`: used others, such as `{image}`"));
+        return Ok(around);
     }
-    capture.assumptions.insert(0, format!("the usual places hold no capture: used `{model}`"));
     Ok(capture)
 }
 
@@ -300,8 +313,17 @@ fn most_complete(all: &[Description], needed: bool) -> Result<Capture> {
 /// Returns true if a folder or its parent has a description, or if the folder is an export of another program or holds
 /// captures in unusual places.
 pub(in crate::dataset) fn is_described(folder: &Path) -> bool {
-    let is_near = std::iter::once(folder).chain(folder.parent()).any(|near| !descriptions(near).is_empty());
+    let above = above(folder);
+    let is_near = [Some(folder), above.as_deref()].into_iter().flatten().any(|near| !descriptions(near).is_empty());
     is_near || EXPORTS.iter().any(|(name, ..)| folder.join(name).exists()) || !elsewhere(folder).is_empty()
+}
+
+/// The folder that holds a folder.
+fn above(folder: &Path) -> Option<PathBuf> {
+    // `.` has no parent in its path.
+    let whole = if folder.file_name().is_some() { folder.to_owned() } else { folder.canonicalize().ok()? };
+    let parent = whole.parent()?;
+    Some(if parent.as_os_str().is_empty() { PathBuf::from(".") } else { parent.to_owned() })
 }
 
 /// Returns true for the name of an archive.
@@ -321,8 +343,7 @@ fn unknown(folder: &Path, asked: Option<Format>) -> Error {
         let found = if found.is_empty() { "no capture".to_owned() } else { found.join(", ") };
         return Error::file(folder, format!("holds no capture in the format {format}, but {found}"));
     }
-    let parent = folder.parent().map(|parent| if parent.as_os_str().is_empty() { Path::new(".") } else { parent });
-    if let Some(parent) = parent.filter(|parent| !descriptions(parent).is_empty()) {
+    if let Some(parent) = above(folder).filter(|parent| !descriptions(parent).is_empty()) {
         return Error::file(folder, format!("is not a dataset, but `{}` is: use that folder", parent.display()));
     }
     if let Some((_, what, remedy)) = EXPORTS.iter().find(|(name, ..)| folder.join(name).exists()) {

@@ -232,12 +232,17 @@ fn files(
     let paths: Vec<&str> = names.iter().flatten().map(String::as_str).collect();
     let found = locate(folder, &paths, taken, assumptions);
     let mut found = found.map_err(|(i, what)| frames[listed[i]].error(member, what))?;
-    let lost = (0..paths.len()).filter(|&i| found[i].is_none());
-    let (lost, plain): (Vec<usize>, Vec<String>) = lost.filter_map(|i| Some((i, paths::plain(paths[i])?))).unzip();
-    if !lost.is_empty() {
+    // ScanNet++ lists masks by their names alone, which are in a folder of masks.
+    let in_masks = |path: &str| (member == "mask_path" && !path.contains('/')).then(|| format!("masks/{path}"));
+    for rename in [&paths::plain as &dyn Fn(&str) -> Option<String>, &in_masks] {
+        let lost = (0..paths.len()).filter(|&i| found[i].is_none());
+        let (lost, renamed): (Vec<usize>, Vec<String>) = lost.filter_map(|i| Some((i, rename(paths[i])?))).unzip();
+        if lost.is_empty() {
+            continue;
+        }
         let taken = found.iter().flatten().map(|file| file.path.clone()).chain(taken.iter().cloned()).collect();
-        let plain: Vec<&str> = plain.iter().map(String::as_str).collect();
-        let others = locate(folder, &plain, &taken, &mut vec![]);
+        let renamed: Vec<&str> = renamed.iter().map(String::as_str).collect();
+        let others = locate(folder, &renamed, &taken, &mut vec![]);
         let others = others.map_err(|(i, what)| frames[listed[lost[i]]].error(member, what))?;
         let mut notes = vec![];
         for (i, file) in lost.into_iter().zip(others).filter_map(|(i, file)| Some((i, file?))) {

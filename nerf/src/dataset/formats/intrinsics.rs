@@ -13,7 +13,7 @@ use serde_json::{Map, Value};
 use std::f64::consts::PI;
 
 /// Unsupported camera fields of instant-ngp and nerfstudio. Ignoring them silently would spoil every image.
-const NOT_READ: [&str; 15] = [
+const NOT_READ: [&str; 17] = [
     "x_fov",
     "y_fov",
     "distortion_params",
@@ -26,18 +26,42 @@ const NOT_READ: [&str; 15] = [
     "latlong",
     "equirectangular",
     "rolling_shutter",
+    "rolling_shutter_time",
     "transform_matrix_start",
     "transform_matrix_end",
     "black_transparent",
+    "normal_mts_args",
 ];
 
 /// Lists of distortion coefficients in other programs. They count where none are given by name.
-const DISTORTIONS: [&str; 6] =
-    ["dist_coeffs", "dist", "distortion", "distortion_coefficients", "radial_distortion", "tangential_distortion"];
+const DISTORTIONS: [&str; 9] = [
+    "dist_coeffs",
+    "dist_coefs",
+    "distCoeffs",
+    "D",
+    "dist",
+    "distortion",
+    "distortion_coefficients",
+    "radial_distortion",
+    "tangential_distortion",
+];
+
+/// Texts in other programs that name a kind of camera. Those that name a wide one count.
+const KINDS: [&str; 4] = ["camera_type", "projection", "fisheye", "distortion_model"];
+const WIDE: [&str; 4] = ["fish", "equidistant", "equirect", "spherical"];
 
 /// Names of an intrinsic matrix (focal lengths on the diagonal, the principal point in the last column), and of a list or
 /// object of fx, fy, cx and cy.
-const MATRICES: [&str; 6] = ["K", "intrinsics", "camera_intrinsics", "intrinsic_matrix", "camera_matrix", "cam_K"];
+const MATRICES: [&str; 8] = [
+    "K",
+    "intrinsics",
+    "camera_intrinsics",
+    "intrinsic_matrix",
+    "camera_matrix",
+    "cam_K",
+    "intrinsic",
+    "cam_intrinsic",
+];
 
 /// Names of a focal length that may be in millimetres, and of a field of view that may be in degrees.
 const UNCLEAR: [&str; 8] = ["focal_length", "focal", "fov", "fovx", "fov_x", "FovX", "hfov", "field_of_view"];
@@ -83,7 +107,11 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     // A number is a distance, and a text such as "none" no coefficient.
     let is_list = |value: &Value| value.is_array() || value.is_object();
     let lists = DISTORTIONS.iter().filter(|name| object.get("k1").is_none() && object.get(name).is_some_and(is_list));
-    let all = NOT_READ.iter().chain(lists);
+    let is_wide = |name: &&&str| {
+        let text = object.get(name).and_then(Value::as_str).map(str::to_lowercase);
+        object.get("camera_model").is_none() && text.is_some_and(|text| WIDE.iter().any(|kind| text.contains(kind)))
+    };
+    let all = NOT_READ.iter().chain(lists).chain(KINDS.iter().filter(is_wide));
     let named = all.copied().find_map(|name| Some((name, object.get(name).filter(|value| !nothing(value))?)));
     let Some((name, value)) = named else { return Ok(()) };
     let what = match name {
@@ -94,8 +122,14 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
             "write the coefficients by name (k1, k2, p1, p2) with their camera_model; OpenCV lists k1, k2, p1, p2, k3"
         }
         "fisheye_crop_radius" => "write masks of the pixels to use, as mask_path",
-        "rolling_shutter" | "transform_matrix_start" | "transform_matrix_end" => {
+        name if KINDS.contains(&name) => {
+            "write camera_model OPENCV_FISHEYE, another fisheye model or EQUIRECTANGULAR, with its coefficients"
+        }
+        "rolling_shutter" | "rolling_shutter_time" | "transform_matrix_start" | "transform_matrix_end" => {
             "rolling shutter is not supported; remove it to ignore it"
+        }
+        "normal_mts_args" => {
+            "it means axes of Mitsuba: negate the first and the third column of all matrices, and remove it"
         }
         "black_transparent" => "write the transparency into the images; remove it to ignore it",
         _ => "such cameras are not supported; remove it to ignore it",
@@ -110,6 +144,13 @@ fn matrix_of<'a>(object: &'a Object<'_>) -> Option<(&'static str, &'a Value, Vec
         let value = object.get(name)?;
         Some((name, value, entries_of(value)?))
     })
+}
+
+/// The first value under the name of an [intrinsic matrix](MATRICES) that is none.
+fn unread_matrix<'a>(object: &'a Object<'_>) -> Option<(&'static str, &'a Value)> {
+    let of_name =
+        |name| Some((name, object.get(name).filter(|value| !value.is_null() && entries_of(value).is_none())?));
+    MATRICES.into_iter().find_map(of_name)
 }
 
 /// What is wrong with an [intrinsic matrix](MATRICES) that some programs write for images without a camera.
@@ -250,6 +291,15 @@ impl Layers<'_, '_> {
     fn focal(&self, size: [usize; 2], angle_y: bool) -> Result<[f64; 2]> {
         let [top, frame] = [focal_of(self.top, size, angle_y)?, focal_of(self.frame, size, angle_y)?];
         let given = if frame == [None; 2] { top } else { frame };
+        // The file's focal length would take the place of that of the frame.
+        if frame == [None; 2]
+            && top != [None; 2]
+            && let Some((name, value)) = unread_matrix(self.frame)
+        {
+            let what = "which raygrad does not read: write a 3x3 matrix, fx, fy, cx and cy, or remove it to use the \
+                        file's focal length";
+            return Err(self.frame.error(name, format!("is {}, {what}", shown(value))));
+        }
         match (given, top) {
             ([Some(x), Some(y)], _) => Ok([x, y]),
             ([None, None], _) => {
@@ -278,13 +328,32 @@ impl Layers<'_, '_> {
         }
     }
 
-    /// True if the frame has the file's focal length, and none gives the size of its image.
+    /// True if the frame has the file's focal length, which is of no size, and does not describe a crop.
+    ///
+    /// # Errors
+    /// If that focal length is of another size than the frame's own.
     pub(super) fn is_focal_alone(&self, camera: &Camera, angle_y: bool) -> Result<bool> {
-        if camera.lens == Lens::Equirectangular {
+        let size = [camera.width, camera.height];
+        if camera.lens == Lens::Equirectangular || focal_of(self.frame, size, angle_y)? != [None; 2] {
             return Ok(false);
         }
-        let own = focal_of(self.frame, [camera.width, camera.height], angle_y)?;
-        Ok(own == [None; 2] && self.size()?.is_none())
+        let [of_file, own] = [self.top, self.frame].map(|object| Layers { top: object, frame: object }.size());
+        let (of_file, own) = (of_file?, own?);
+        if own.is_some() && self.own_centre()? != [None; 2] {
+            return Ok(false);
+        }
+        let (Some([w, h]), Some(own)) = (of_file, own) else { return Ok(of_file.is_none()) };
+        // Images may stand on their side. An angle is that of any size.
+        let is_same = own == [w, h] || own == [h, w];
+        if is_same || focal_of(self.top, [w, h], angle_y)? != focal_of(self.top, own, angle_y)? {
+            return Ok(false);
+        }
+        let what = format!(
+            "is {}, but the file's focal length is of {w}x{h} pixels: give the frame its own `fl_x` and `fl_y` if it is \
+             scaled, or its own `cx` and `cy` if it is cropped",
+            own[0]
+        );
+        Err(self.frame.error("w", what))
     }
 
     /// A note on a field of view that contradicts the focal length of `camera`, which counts, as in other programs.
@@ -299,7 +368,12 @@ impl Layers<'_, '_> {
         }
         // The file's lengths belong to its own size.
         let own = Layers { top: self.top, frame: self.top }.size().ok()?;
-        contradiction(self.top, own.unwrap_or(size), angle_y)
+        contradiction(self.top, own.unwrap_or(size), angle_y).or_else(|| {
+            let unclear = UNCLEAR.into_iter().find_map(|name| Some((self.frame.field(name), self.frame.get(name)?)));
+            let of_file = || unread_matrix(self.top).map(|(name, value)| (self.top.field(name), value));
+            let (field, value) = unclear.or_else(of_file)?;
+            Some(format!("`{field}` is {}, which raygrad does not read: used the file's focal length", shown(value)))
+        })
     }
 
     /// The focal lengths of a panorama of all directions, in pixels per radian.

@@ -218,15 +218,24 @@ fn is_image(name: &str) -> bool {
     !name.starts_with('.') && extension(name).is_some()
 }
 
-/// The names of the files in a folder.
+/// The names of the files in a folder. Those that are not UTF-8 must not be images.
 fn names(folder: &Path) -> Result<Vec<String>> {
     let bad = |e: std::io::Error| Error::file(folder, format!("cannot be read: {e}"));
     let entries = std::fs::read_dir(folder).map_err(bad)?;
     let name = |entry: std::io::Result<std::fs::DirEntry>| {
-        let name = entry.map_err(bad)?.file_name();
-        name.into_string().map_err(|name| Error::file(folder.join(name), "has a name that is not UTF-8: rename it"))
+        let entry = match entry {
+            Ok(entry) => entry,
+            Err(error) => return Some(Err(bad(error))),
+        };
+        match entry.file_name().into_string() {
+            Ok(name) => Some(Ok(name)),
+            Err(name) if is_image(&name.to_string_lossy()) => {
+                Some(Err(Error::file(folder.join(name), "has a name that is not UTF-8: rename it")))
+            }
+            Err(_) => None,
+        }
     };
-    entries.map(name).collect()
+    entries.filter_map(name).collect()
 }
 
 /// Writes the cameras of `capture` to `poses_bounds.npy` in `folder`, which must exist.

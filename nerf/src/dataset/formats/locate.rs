@@ -18,7 +18,22 @@ const MOST_ENTRIES: usize = 200_000;
 /// Names of folders with the images of a split. Those of one split never take the place of another's.
 const SPLITS: [&str; 4] = ["train", "val", "eval", "test"];
 /// Words in the names of folders with other files than images.
-const LAYERS: [&str; 7] = ["mask", "depth", "normal", "segment", "confidence", "alpha", "label"];
+const LAYERS: [&str; 12] = [
+    "mask",
+    "depth",
+    "normal",
+    "segment",
+    "confidence",
+    "alpha",
+    "label",
+    "dispar",
+    "semantic",
+    "instance",
+    "thumb",
+    "preview",
+];
+/// Further ones, which may be parts of other words.
+const LAYER_WORDS: [&str; 6] = ["seg", "flow", "edge", "edges", "matte", "mattes"];
 /// The last parts of a listed path that state its kind; those before are the user's.
 const STATED: usize = 2;
 
@@ -319,7 +334,11 @@ fn wanted(place: &str) -> Vec<String> {
 /// Returns true if the files of a folder may be those of a listed one: of the same splits and layers.
 fn is_of_kind(own: &[String], wanted: &[String]) -> bool {
     let splits = |parts: &[String]| SPLITS.map(|split| parts.iter().any(|part| words(part).any(|word| word == split)));
-    let layers = |parts: &[String]| LAYERS.map(|layer| parts.iter().any(|part| part.contains(layer)));
+    let layers = |parts: &[String]| {
+        let parts = || parts.iter().map(String::as_str);
+        let contained = LAYERS.map(|layer| parts().any(|part| part.contains(layer)));
+        (contained, LAYER_WORDS.map(|layer| parts().any(|part| words(part).any(|word| word == layer))))
+    };
     let stated = layers(&wanted[wanted.len().saturating_sub(STATED)..]);
     splits(own).iter().zip(splits(wanted)).all(|(own, wanted)| *own <= wanted) && layers(own) == stated
 }

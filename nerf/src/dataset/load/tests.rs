@@ -174,13 +174,38 @@ fn downscaled_image_folders_are_used() {
     let [own, other] = ["images/03.png", "images/03.jpg"].map(|name| folder.path().join(name));
     let copy = folder.path().join("images_4/03.jpg");
     std::fs::write(&copy, "").unwrap();
-    assert_eq!(made_smaller(folder.path(), &own, 4), (copy, 1));
+    let smaller = |own: &Path, folder: &Path| smaller_copy(folder, own, own.strip_prefix(folder).unwrap(), 4);
+    assert_eq!(smaller(&own, folder.path()), Some(copy));
     std::fs::write(other, "").unwrap();
-    assert_eq!(made_smaller(folder.path(), &own, 4), (own, 4));
-    let alone = Path::new("scene/images_4/a/01.png");
-    assert_eq!(made_smaller(Path::new("scene"), alone, 8), (alone.to_owned(), 2));
-    assert_eq!(made_smaller(Path::new("scene"), alone, 4), (alone.to_owned(), 1));
-    assert_eq!(made_smaller(Path::new("images/scene"), Path::new("images/scene/01.png"), 4).1, 4);
+    assert_eq!(smaller(&own, folder.path()), None);
+    assert_eq!(smaller(Path::new("images/scene/01.png"), Path::new("images/scene")), None);
+}
+
+#[test]
+fn downscaled_images_of_another_size_are_not_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let capture = capture(folder.path(), 4);
+    std::fs::create_dir(folder.path().join("images_4")).unwrap();
+    let view = &capture.views[0];
+    let (image, camera) = (view.image.clone().unwrap(), &view.camera);
+    let name = image.file_name().unwrap();
+    let copy = folder.path().join("images_4").join(name);
+    let [w, h] = Header::read(&image).unwrap().sizes[0];
+    let factor = || made_smaller(folder.path(), &image, camera, 4).unwrap();
+    // Half the right size; turned, as by ffmpeg, which leaves out the orientation; and no image.
+    for (width, height, is_used) in [(w / 4, h / 4, true), (w / 8, h / 8, false), (h / 4, w / 4, false), (0, 0, false)]
+    {
+        let pixels = Image { width, height, channels: 3, data: vec![1.0; 3 * width * height] };
+        std::fs::write(&copy, if width > 0 { pixels.to_png() } else { vec![] }).unwrap();
+        let (path, _, size, rest) = factor();
+        let expected = if is_used { (copy.clone(), [width, height], 1) } else { (image.clone(), [w, h], 4) };
+        assert_eq!((path, size, rest), expected, "{width}x{height}");
+    }
+    // The capture itself lists downscaled images.
+    let listed = folder.path().join("images_4").join(name);
+    std::fs::copy(&image, &listed).unwrap();
+    assert_eq!(made_smaller(folder.path(), &listed, camera, 8).unwrap().3, 2);
+    assert_eq!(made_smaller(folder.path(), &listed, camera, 4).unwrap().3, 1);
 }
 
 #[test]

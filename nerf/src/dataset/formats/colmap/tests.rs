@@ -403,6 +403,9 @@ fn text_images_without_empty_lines_are_read() {
     let observed = "1 1 0 0 0 0 0 4 7 a.png\n10.5 11.5 1 12.5 13.5 -1\n";
     let names = images(&format!("{observed}2 1 0 0 0 0 0 4 7 b c.JPG\n3 1 0 0 0 0 0 4 7 d.png\n\n")).unwrap();
     assert_eq!(names, ["a.png", "b c.JPG", "d.png"]);
+    // Comments between, and images that raygrad does not decode, whose lines are no observations.
+    let other = "1 1 0 0 0 0 0 4 7 a.tif\n# none\n2 1 0 0 0 0 0 4 7 b.HEIC\n#\n\n3 1 0 0 0 0 0 4 7 c.bmp\n";
+    assert_eq!(images(other).unwrap(), ["a.tif", "b.HEIC", "c.bmp"]);
     // Neither observations nor an image.
     for line in ["2 1 0 0 0 0 0 4 7 b", "2 1 0 0 0 x 0 4 7 b.png", "1 0 0 0 0 0 4 7 b.png x"] {
         let message = images(&format!("1 1 0 0 0 0 0 4 7 a.png\n{line}\n")).unwrap_err().to_string();

@@ -2,7 +2,7 @@
 
 use super::super::encodings::decoded;
 use super::super::limits::start;
-use super::super::paths::extension;
+use super::super::paths::any_extension;
 use super::super::points::{Points, reason};
 use super::entries::{CameraEntry, ImageEntry, Place};
 use super::models;
@@ -117,6 +117,7 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
         let camera = line.integer("CAMERA_ID")?;
         // The name is the rest of the line, since it may contain spaces.
         images.push(ImageEntry::new(file, line.place, id, q, t, camera, line.rest.trim())?);
+        while lines.next_if(|line| line.rest.trim_start().starts_with('#')).is_some() {}
         // The next line holds the image's observations, also if it is empty. Some programs leave empty lines out.
         if let Some(line) = lines.next_if(|line| !is_image(line.rest)) {
             observations(&line)?;
@@ -129,7 +130,7 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
 fn is_image(line: &str) -> bool {
     let words: Vec<&str> = line.split_whitespace().collect();
     let is_number = |word: &&str| word.parse::<f64>().is_ok() || nan(word).is_some();
-    words.len() >= 10 && words[..9].iter().all(is_number) && extension(line).is_some()
+    words.len() >= 10 && words[..9].iter().all(is_number) && any_extension(line).is_some()
 }
 
 /// Checks that a line holds observations, so that no image is lost silently.

@@ -304,7 +304,7 @@ fn captures_are_found_in_unusual_places() {
         // Points are beside the file.
         let text = std::fs::read_to_string(path.join(&file)).unwrap();
         let text = text.replacen('{', "{\"ply_file_path\": \"points.ply\",", 1);
-        std::fs::write(path.join(&file), text).unwrap();
+        std::fs::write(path.join(&file), &text).unwrap();
         let points = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
                       end_header\n1 2 3\n";
         std::fs::write(path.join(place).join("points.ply"), points).unwrap();
@@ -312,6 +312,27 @@ fn captures_are_found_in_unusual_places() {
         assert_eq!((capture.present().count(), capture.points.len(), &*capture.folder), (3, 1, path), "{file}");
         let note = format!("no images are beside `{file}`: used others, such as `{images}/0.png`");
         assert_eq!(capture.assumptions.last(), Some(&note));
+        // The file itself, or a folder above the images, may be named. ScanNet++ lists masks by their names alone.
+        assert_eq!(read(&path.join(&file), None).unwrap().present().count(), 3);
+        let outer = tempfile::tempdir().unwrap();
+        let inner = outer.path().join("dslr");
+        for folder in [place, images] {
+            std::fs::create_dir_all(inner.join(folder)).unwrap();
+            for entry in std::fs::read_dir(path.join(folder)).unwrap().flatten() {
+                std::fs::copy(entry.path(), inner.join(folder).join(entry.file_name())).unwrap();
+            }
+        }
+        let mut document: serde_json::Value = serde_json::from_str(&text).unwrap();
+        for (i, frame) in document["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
+            frame["mask_path"] = serde_json::json!(format!("{i}.png"));
+            kit::picture(&inner.join(format!("resized_anon_masks/{i}.png")), 8, 6);
+        }
+        std::fs::write(inner.join(&file), document.to_string()).unwrap();
+        for named in [outer.path().to_owned(), inner.clone(), inner.join(&file)] {
+            let capture = read(&named, None).unwrap();
+            assert_eq!(capture.present().count(), 3, "{}", named.display());
+            assert_eq!(capture.views[0].mask, Some(inner.join("resized_anon_masks/0.png")), "{}", named.display());
+        }
         assert_eq!(read_file(path, &path.join(&file), true).unwrap().present().count(), 3, "as a run keeps it");
         // Some images beside the file are its own.
         kit::picture(&path.join(place).join(if images == "images" { "images/0.png" } else { "0.png" }), 8, 6);
@@ -387,4 +408,13 @@ fn exports_of_other_programs_are_named() {
         let message = read(folder.path(), None).unwrap_err().to_string();
         assert!(message.contains(what) && message.contains(remedy), "{message}");
     }
+}
+
+#[test]
+fn the_folder_above_the_current_one_is_found() {
+    let here = std::env::current_dir().unwrap();
+    assert_eq!(above(Path::new(".")), here.parent().map(Path::to_owned));
+    assert_eq!(above(Path::new("a")), Some(PathBuf::from(".")));
+    assert_eq!(above(Path::new("a/b/")), Some(PathBuf::from("a")));
+    assert_eq!(above(Path::new("/")), None);
 }

@@ -101,6 +101,91 @@ fn angles_replace_absent_focal_lengths() {
     fails(|d| without(d, &["fl_x", "fl_y"]), &["`camera_angle_x`: is missing", "fl_x and fl_y"]);
 }
 
+/// A frame's camera that raygrad does not read must not be replaced by the file's without a word.
+#[test]
+fn cameras_of_frames_that_are_not_read_are_refused_or_noted() {
+    let own = |fields: Value| move |d: &mut Value| set(&mut d["frames"][1], &fields);
+    for (name, value) in [
+        ("intrinsics", json!({ "fx": 90, "fy": 90, "cx": 31, "cy": 25, "k1": 0.1 })),
+        ("K", json!("90 0 31 0 90 25 0 0 1")),
+        ("K", json!([[90, 0, 31], [0, 90, 25]])),
+        ("camera_matrix", json!({ "data": [90, 0, 31, 0, 90, 25, 0, 0, 1], "rows": 3, "cols": 3 })),
+        ("cam_intrinsic", json!([90, 90, 31, 25, 0.1])),
+    ] {
+        let parts = [&*format!("`frames[1].{name}`: is "), "which raygrad does not read: write a 3x3 matrix"];
+        fails(own(json!({ name: value })), &parts);
+        // A focal length of its own explains it.
+        assert_eq!(cameras(own(json!({ name: value, "fl_x": 80, "fl_y": 80 })))[1].focal, [80.0; 2]);
+    }
+    assert_eq!(cameras(own(json!({ "K": null })))[1].focal, [100.0, 110.0]);
+    let notes = |change: &dyn Fn(&mut Value)| {
+        let (folder, mut document) = (tempfile::tempdir().unwrap(), document());
+        change(&mut document);
+        std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+        transforms::read(folder.path()).unwrap().assumptions
+    };
+    let note = |field: &str, value: &str| {
+        format!("`{field}` is {value}, which raygrad does not read: used the file's focal length")
+    };
+    let focal = own(json!({ "focal_length": 4.2 }));
+    assert_eq!(notes(&|d| focal(d)), [note("frames[1].focal_length", "4.2")]);
+    assert_eq!(notes(&|d| d["intrinsics"] = json!({ "fx": 9, "k1": 1 })), [note("intrinsics", r#"{"fx":9,"k1":1}"#)]);
+    assert_eq!(notes(&own(json!({ "fl_x": 80, "fl_y": 80, "focal_length": 4.2 }))), [""; 0]);
+}
+
+/// A focal length of the file belongs to the file's size, or to images of one shape and any size.
+#[test]
+fn sizes_of_frames_without_their_focal_length_are_refused() {
+    let read = |sizes: [[usize; 2]; 2], change: &dyn Fn(&mut Value)| {
+        let (folder, mut document) = (tempfile::tempdir().unwrap(), document());
+        ["cx", "cy"].iter().for_each(|name| remove(&mut document, name));
+        for (i, [w, h]) in sizes.into_iter().enumerate() {
+            picture(&folder.path().join(format!("{i}.png")), w, h);
+            document["frames"][i]["file_path"] = json!(format!("{i}.png"));
+        }
+        change(&mut document);
+        std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+        transforms::read(folder.path())
+            .map(|capture| capture.views.into_iter().map(|v| v.camera.focal).collect::<Vec<_>>())
+    };
+    let half = json!({ "w": 32, "h": 24 });
+    let sizes = [[64, 48], [32, 24]];
+    let own = |fields: &Value| {
+        let fields = fields.clone();
+        move |d: &mut Value| set(&mut d["frames"][1], &fields)
+    };
+    let message = read(sizes, &own(&half)).unwrap_err().to_string();
+    says(&message, &["`frames[1].w`: is 32, but the file's focal length is of 64x48 pixels: give the frame its own"]);
+    // A crop, an own focal length, an angle, and an image on its side are clear.
+    let clear = |fields: Value| {
+        let mut all = half.clone();
+        set(&mut all, &fields);
+        read(sizes, &own(&all)).unwrap()[1]
+    };
+    assert_eq!(clear(json!({ "cx": 10, "cy": 12 })), [100.0, 110.0]);
+    assert_eq!(clear(json!({ "fl_x": 50, "fl_y": 55 })), [50.0, 55.0]);
+    let of_angle = |d: &mut Value| {
+        ["fl_x", "fl_y"].iter().for_each(|name| remove(d, name));
+        d["camera_angle_x"] = json!(0.8);
+        own(&half)(d);
+    };
+    assert!(read(sizes, &of_angle).is_ok());
+    assert!(read([[64, 48], [48, 64]], &own(&json!({ "w": 48, "h": 64 }))).is_ok());
+    // Without the file's size, the frames' sizes must be of one camera.
+    let all = |second: [usize; 2]| {
+        move |d: &mut Value| {
+            ["w", "h"].iter().for_each(|name| remove(d, name));
+            d["fl_y"] = json!(100.0);
+            for (i, [w, h]) in [[64, 48], second].into_iter().enumerate() {
+                set(&mut d["frames"][i], &json!({ "w": w, "h": h }));
+            }
+        }
+    };
+    let message = read(sizes, &all([32, 24])).unwrap_err().to_string();
+    says(&message, &["`w`: is missing beside the focal length, which images of 64x48", "and 32x24"]);
+    assert!(read([[64, 48]; 2], &all([64, 48])).is_ok());
+}
+
 #[test]
 fn contradicting_angles_are_noted() {
     let notes = |change: &dyn Fn(&mut Value)| {

@@ -43,6 +43,12 @@ const IMAGES: [&str; 5] = ["images/b.JPG", "images/a.png", "images/notes.txt", "
 #[test]
 fn llff_rows_follow_image_names() {
     let folder = folder(&npy(&ROWS), &IMAGES);
+    #[cfg(unix)]
+    {
+        use std::os::unix::ffi::OsStrExt;
+        let other = std::ffi::OsStr::from_bytes(b"images/caf\xe9.txt");
+        fs::write(folder.path().join(other), "").unwrap();
+    }
     let capture = read(folder.path()).unwrap();
     let [a, b] = &capture.views[..] else { panic!("{} views", capture.views.len()) };
     assert_eq!((a.name.as_str(), b.name.as_str(), a.field.as_str()), ("a.png", "b.JPG", "row 0"));

@@ -142,6 +142,13 @@ fn files_of_another_kind_take_no_place() {
     absent(&["val/r_0.png", "test/r_0.png"], &["train/r_0.png"]);
     absent(&["masks/0.png", "depth/0.png", "normals/0.png", "segmentation/0.png"], &["images/0.jpg"]);
     absent(&["confidence/0.png", "alpha/0.png", "label/0.png", "Labels/0.png"], &["images/0.jpg"]);
+    for layer in ["disparity", "semantic", "instance", "seg", "flow", "edges", "matte", "thumbnails", "preview_jpg"] {
+        absent(&[&format!("{layer}/0.png")], &["images/0.png"]);
+    }
+    for scene in ["flower", "matterhorn", "hedges"] {
+        let file = format!("{scene}/0.png");
+        finds(&[&file], &["images/0.png"], &[&file]);
+    }
     finds(&["confidence/0.png", "rgb/0.png"], &["images/0.png"], &["rgb/0.png"]);
     absent(&["images/0.png"], &["masks/0.png"]);
     absent(&["train_hr/r_0.png"], &["test/r_0.png"]);
