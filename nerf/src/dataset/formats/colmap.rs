@@ -56,6 +56,17 @@ pub(super) fn models_in(folder: &Path) -> Vec<PathBuf> {
     files.filter(|[cameras, images, _]| cameras.is_file() && images.is_file()).map(|[_, images, _]| images).collect()
 }
 
+/// The file of cameras or images of a model without its own, and the missing one.
+pub(super) fn half_a_model_in(folder: &Path) -> Option<[PathBuf; 2]> {
+    Encoding::ALL.into_iter().map(|encoding| encoding.files(folder)).find_map(|[cameras, images, _]| {
+        match (cameras.is_file(), images.is_file()) {
+            (true, false) => Some([cameras, images]),
+            (false, true) => Some([images, cameras]),
+            _ => None,
+        }
+    })
+}
+
 /// The file of images of the model that a file is part of.
 pub(super) fn images_beside(file: &Path) -> Option<PathBuf> {
     let mut files = Encoding::ALL.into_iter().map(|encoding| encoding.files(file.parent().unwrap_or(Path::new(""))));

@@ -1,5 +1,6 @@
 //! Which files of a folder describe a capture.
 
+use super::exports::{self, is_archive};
 use super::locate::{shown, walk};
 use super::{blender, colmap, llff, transforms};
 use crate::camera::lens::Lens;
@@ -7,36 +8,6 @@ use crate::dataset::capture::{Capture, Format, View};
 use crate::dataset::frames::Split;
 use crate::error::{Error, Result};
 use std::path::{Path, PathBuf};
-
-/// Files of other programs that are no capture yet: a file or folder, the program, and the remedy.
-const EXPORTS: [(&str, &str, &str); 23] = [
-    ("keyframes", "a raw export of Polycam", "convert it with nerfstudio's `ns-process-data polycam`"),
-    ("rgbd", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
-    ("EXR_RGBD", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
-    ("intrinsics.txt", "a dataset of NSVF", "write its poses as transforms_train.json"),
-    ("cameras_sphere.npz", "a dataset of DTU", "write its matrices as transforms.json"),
-    ("cameras.npz", "a dataset of IDR or VolSDF", "write its matrices as transforms.json"),
-    ("meta_data.json", "a dataset of SDFStudio", "write its frames as transforms.json"),
-    ("intrinsic/intrinsic_color.txt", "a scene of ScanNet", "write its poses as transforms.json"),
-    ("cams/00000000_cam.txt", "a dataset of MVSNet", "write its cameras as transforms.json"),
-    ("odometry.csv", "a scan of Stray Scanner", "write its poses as transforms.json"),
-    ("cameras.xml", "an export of Agisoft Metashape", "convert it with nerfstudio's `ns-process-data metashape`"),
-    ("odm_report", "a project of OpenDroneMap", "convert it with nerfstudio's `ns-process-data odm`"),
-    ("reconstruction.json", "a reconstruction of OpenSfM", "convert it with `opensfm export_colmap`"),
-    ("sfm_data.json", "a scene of OpenMVG", "convert it with `openMVG_main_openMVG2Colmap`"),
-    ("sfm_data.bin", "a scene of OpenMVG", "convert it with `openMVG_main_openMVG2Colmap`"),
-    ("cameras.sfm", "a scene of Meshroom", "convert it with `aliceVision_exportColmap`"),
-    ("bundle.out", "a reconstruction of Bundler", "write its cameras as transforms.json"),
-    ("train/pose", "a dataset of NeRF++", "write its matrices as transforms.json"),
-    ("results/frame000000.jpg", "a sequence of Replica", "write its matrices as transforms.json"),
-    ("rgb.txt", "a sequence of TUM RGB-D", "write its poses as transforms.json"),
-    ("cfg_args", "an output of 3D Gaussian Splatting", "name the capture that its `source_path` names"),
-    ("dataparser_transforms.json", "a run of nerfstudio", "name the capture that it was trained on"),
-    ("database.db", "a COLMAP project without a model", "run COLMAP's mapper, or `raygrad prepare` on the images"),
-];
-
-/// Endings of archives. Those of Record3D are zip files.
-const ARCHIVES: [&str; 7] = ["zip", "r3d", "7z", "rar", "tar", "gz", "tgz"];
 
 /// The deepest folders that are searched for a description in an unusual place: the first, and if these hold none.
 const DEEPEST: [usize; 2] = [3, 4];
@@ -202,6 +173,9 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
         if is_archive(path) {
             return Err(Error::file(path, "is an archive: unpack it, and name the folder"));
         }
+        if let Some(what) = exports::of_file(path) {
+            return Err(Error::file(path, what));
+        }
         let what = "does not describe a capture: name a folder, a .json file, poses_bounds.npy, or images.bin of a COLMAP \
                     model";
         let description = Description::of_file(path).ok_or_else(|| Error::file(path, what))?;
@@ -315,7 +289,7 @@ fn most_complete(all: &[Description], needed: bool) -> Result<Capture> {
 pub(in crate::dataset) fn is_described(folder: &Path) -> bool {
     let above = above(folder);
     let is_near = [Some(folder), above.as_deref()].into_iter().flatten().any(|near| !descriptions(near).is_empty());
-    is_near || EXPORTS.iter().any(|(name, ..)| folder.join(name).exists()) || !elsewhere(folder).is_empty()
+    is_near || exports::of_folder(folder).is_some() || !elsewhere(folder).is_empty()
 }
 
 /// The folder that holds a folder.
@@ -324,12 +298,6 @@ fn above(folder: &Path) -> Option<PathBuf> {
     let whole = if folder.file_name().is_some() { folder.to_owned() } else { folder.canonicalize().ok()? };
     let parent = whole.parent()?;
     Some(if parent.as_os_str().is_empty() { PathBuf::from(".") } else { parent.to_owned() })
-}
-
-/// Returns true for the name of an archive.
-fn is_archive(path: &Path) -> bool {
-    let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
-    ARCHIVES.iter().any(|other| other.eq_ignore_ascii_case(ending))
 }
 
 /// The error of a folder without a description.
@@ -346,8 +314,11 @@ fn unknown(folder: &Path, asked: Option<Format>) -> Error {
     if let Some(parent) = above(folder).filter(|parent| !descriptions(parent).is_empty()) {
         return Error::file(folder, format!("is not a dataset, but `{}` is: use that folder", parent.display()));
     }
-    if let Some((_, what, remedy)) = EXPORTS.iter().find(|(name, ..)| folder.join(name).exists()) {
-        return Error::file(folder, format!("is {what}, which raygrad does not read: {remedy}"));
+    if let Some(what) = exports::of_folder(folder) {
+        return Error::file(folder, what);
+    }
+    if let Some((inside, what)) = exports::below(folder) {
+        return Error::file(folder, format!("is not a dataset, and its folder `{}` {what}", shown(&inside)));
     }
     let files = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     if let Some(archive) = files.filter(|path| is_archive(path)).min() {

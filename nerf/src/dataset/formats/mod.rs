@@ -7,6 +7,7 @@ pub mod blender;
 pub mod colmap;
 mod description;
 mod encodings;
+mod exports;
 mod frames;
 mod intrinsics;
 mod json;
