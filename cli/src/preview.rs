@@ -31,7 +31,9 @@ impl Preview {
         match held_out {
             Ok(data) => Self::new(&data.frames[0], None, background),
             Err(error) => {
-                complain(&format!("warning: previews show a training image, because no image is held out: {error}"));
+                complain(&format!(
+                    "warning: previews show a training image, because no held-out image can be used: {error}"
+                ));
                 Self::new(&train.frames[0], Some(0), background)
             }
         }

@@ -1,6 +1,6 @@
 //! Conversion of a dataset to another format.
 
-use std::collections::HashSet;
+use std::collections::HashMap;
 use std::path::{Component, Path, PathBuf};
 
 use clap::ValueEnum;
@@ -353,15 +353,21 @@ fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
 fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> Result<Vec<Job>> {
     let has_masks = target.has_masks();
     let has_depths = target.has_depths() && !undistorted;
-    let mut taken = HashSet::new();
+    let mut taken = HashMap::new();
     let mut jobs = vec![];
     for view in &capture.views {
         let rest = relative(&capture.folder, view)?;
         let inner = inner(&rest);
         let (image, name) = target.place(inner, &rest, view.split);
-        if !taken.insert(image.clone()) {
-            let what = format!("`{}` and another image would both become {image}: rename one", view.name);
-            return Err(Error::field(&capture.file, &view.field, what));
+        let of_field = |what: String| Err(Error::field(&capture.file, &view.field, what));
+        match taken.insert(image.clone(), &view.image) {
+            Some(other) if other.is_some() && *other == view.image => {
+                return of_field(format!("lists `{}` a second time: remove one of them", view.name));
+            }
+            Some(_) => {
+                return of_field(format!("`{}` and another image would both become {image}: rename one", view.name));
+            }
+            None => {}
         }
         let mut to = view.clone();
         to.image = view.image.as_ref().map(|_| folder.join(&image));
@@ -478,6 +484,7 @@ fn make_parent(path: &Path) -> Result<()> {
 mod tests {
     use super::*;
     use glam::DAffine3;
+    use std::collections::HashSet;
 
     #[test]
     fn place_follows_the_target_format() {

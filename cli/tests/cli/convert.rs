@@ -156,6 +156,14 @@ fn unsupported_formats_are_refused_before_writing() {
     transforms["frames"][1].as_object_mut().unwrap().remove("mask_path");
     std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
     place.fails("prepare scene --to llff --undistort --out made", &["more_9.png", "would both become"]);
+    // One image twice.
+    let frame = transforms["frames"][0].clone();
+    transforms["frames"].as_array_mut().unwrap().push(frame);
+    std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
+    let twice = "lists `images/more_9.png` a second time: remove one of them";
+    place.fails("prepare scene --to colmap --out made", &["`frames[", twice]);
+    transforms["frames"].as_array_mut().unwrap().pop();
+    std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
     place.fails_with("prepare scene --to colmap --out scene", "scene: is not empty: choose another --out");
     std::fs::write(place.path("scene/images/5.png"), "no picture").unwrap();
     place.fails("prepare scene --to colmap --out made", &["`frames[5]`", "5.png: cannot be decoded"]);
