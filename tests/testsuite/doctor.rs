@@ -184,8 +184,9 @@ fn mirrored(pose: DAffine3, signs: [f64; 3]) -> DAffine3 {
 
 #[test]
 fn doctor_identifies_pose_conventions() {
-    let conventions: [(&str, Convention, Kind); 6] = [
+    let conventions: [(&str, Convention, Kind); 7] = [
         ("OpenCV", opencv, Kind::OpenCvAxes),
+        ("Mitsuba", |pose| turned(pose, [-1.0, 1.0, -1.0]), Kind::TurnedCameras),
         ("world to camera", |pose| pose.inverse(), Kind::WorldToCamera),
         ("world to OpenCV camera", |pose| opencv(pose).inverse(), Kind::WorldToCamera),
         ("mirrored", |pose| mirrored(pose, [-1.0, 1.0, 1.0]), Kind::Mirrored),

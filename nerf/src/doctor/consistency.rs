@@ -18,8 +18,8 @@ const FEWEST: usize = 8;
 const DEVIATIONS: f64 = 4.0;
 /// The agreement of good cameras.
 const GOOD: f64 = 0.2;
-/// Below this agreement, images and cameras do not match.
-const NONE: f64 = 0.06;
+/// Below this agreement, images and cameras do not match. The report calls it poor.
+const NONE: f64 = 0.1;
 /// An image is wrong if its agreement is below this share of the median.
 const WRONG: f64 = 0.35;
 
@@ -69,15 +69,22 @@ fn another(convention: Convention, [own, other]: [f64; 2], findings: &mut Findin
     let finding = match convention {
         Convention::AsRead => return,
         Convention::OpenCv => findings.add(Kind::OpenCvAxes, &[]),
+        Convention::UpsideDown | Convention::Mitsuba => findings.add(Kind::TurnedCameras, &[]),
         Convention::WorldToCamera | Convention::WorldToOpenCv => findings.add(Kind::WorldToCamera, &[]),
         Convention::Mirrored | Convention::MirroredUpsideDown | Convention::MirroredBackwards => {
             findings.add(Kind::Mirrored, &[])
         }
     };
     finding.what += &format!(" (agreement {other:.2} if changed, {own:.2} as read)");
-    if convention == Convention::WorldToOpenCv {
-        finding.advice += " Then negate the second and third columns: the camera axes are OpenCV's.";
-    }
+    finding.advice += match convention {
+        Convention::WorldToOpenCv => " Then negate the second and third columns: the camera axes are OpenCV's.",
+        Convention::UpsideDown => {
+            " These are the first and the second one. Or turn the images, if their EXIF orientation counts in the poses \
+             alone."
+        }
+        Convention::Mitsuba => " These are the first and the third one: the camera axes are Mitsuba's.",
+        _ => "",
+    };
 }
 
 /// The indices of images that do not match their neighbours, although the neighbours match each other.

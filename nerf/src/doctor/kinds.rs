@@ -111,6 +111,10 @@ kinds! {
     WorldToCamera = "world-to-camera", Error,
         "the matrices seem to be world-to-camera: inverted, all cameras look at one place",
         "Write the inverse of each matrix: camera-to-world, with the camera's position in the last column.";
+    /// Cameras are turned about one of their axes.
+    TurnedCameras = "turned-cameras", Error,
+        "the cameras are turned by 180 degrees against their images",
+        "Negate two columns of the rotation of each matrix.";
     /// Poses are left-handed.
     Mirrored = "mirrored", Error,
         "the cameras mirror the world: one axis has the wrong sign",
@@ -118,7 +122,7 @@ kinds! {
          stays a rotation.";
     /// Images match their cameras under no convention.
     NoAgreement = "no-agreement", Warning,
-        "the images match their cameras no better than chance, under any convention",
+        "the images match their cameras hardly better than chance, under any convention",
         "Check that images and poses have one order, come from one capture and have the right focal length. Images \
          with little texture, such as plain walls, can cause this too.";
     /// Camera positions have another scale than the points, or than the format's convention.

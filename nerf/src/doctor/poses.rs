@@ -11,6 +11,10 @@ pub(super) enum Convention {
     AsRead,
     /// The camera looks along its +z with y down (OpenCV).
     OpenCv,
+    /// The camera is upside down, as its image is if only one of them was turned.
+    UpsideDown,
+    /// The camera looks along its +z with x to the left (Mitsuba).
+    Mitsuba,
     /// World-to-camera.
     WorldToCamera,
     /// World-to-camera, where the camera looks along its +z with y down, as COLMAP stores them.
@@ -25,9 +29,11 @@ pub(super) enum Convention {
 
 impl Convention {
     /// All of them.
-    pub const ALL: [Convention; 7] = [
+    pub const ALL: [Convention; 9] = [
         Convention::AsRead,
         Convention::OpenCv,
+        Convention::UpsideDown,
+        Convention::Mitsuba,
         Convention::WorldToCamera,
         Convention::WorldToOpenCv,
         Convention::Mirrored,
@@ -50,6 +56,8 @@ impl Convention {
         match self {
             Convention::AsRead => pose,
             Convention::OpenCv => turned(pose, DVec3::new(1.0, -1.0, -1.0)),
+            Convention::UpsideDown => turned(pose, DVec3::new(-1.0, -1.0, 1.0)),
+            Convention::Mitsuba => turned(pose, DVec3::new(-1.0, 1.0, -1.0)),
             Convention::WorldToCamera => inverse(),
             Convention::WorldToOpenCv => turned(inverse(), DVec3::new(1.0, -1.0, -1.0)),
             Convention::Mirrored => turned(mirrored(), DVec3::new(-1.0, 1.0, 1.0)),
