@@ -184,6 +184,12 @@ fn sizes_of_frames_without_their_focal_length_are_refused() {
     let message = read(sizes, &all([32, 24])).unwrap_err().to_string();
     says(&message, &["`w`: is missing beside the focal length, which images of 64x48", "and 32x24"]);
     assert!(read([[64, 48]; 2], &all([64, 48])).is_ok());
+    // A principal point alone is no crop.
+    let centred = |d: &mut Value| {
+        ["w", "h"].iter().for_each(|name| remove(d, name));
+        own(&json!({ "cx": 16, "cy": 12 }))(d);
+    };
+    says(&read(sizes, &centred).unwrap_err().to_string(), &["`w`: is missing beside the focal length"]);
 }
 
 #[test]
