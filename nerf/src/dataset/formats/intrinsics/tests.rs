@@ -432,6 +432,18 @@ fn unsupported_camera_fields_are_named() {
         ("rolling_shutter", json!([0, 0, 1, 0]), "rolling shutter is not supported; remove it to ignore it"),
         ("transform_matrix_start", json!([[1, 0, 0, 0]]), "rolling shutter is not supported; remove it to ignore it"),
         ("transform_matrix_end", json!([[1, 0, 0, 0]]), "rolling shutter is not supported; remove it to ignore it"),
+        ("rolling_shutter_time", json!(0.03), "rolling shutter is not supported; remove it to ignore it"),
+        ("normal_mts_args", json!(true), "axes of Mitsuba: negate the first and the third column"),
+        ("D", json!([0.1, 0]), "k1, k2, p1, p2"),
+        ("distCoeffs", json!([0.1, 0]), "k1, k2, p1, p2"),
+        ("dist_coefs", json!([0.1, 0]), "k1, k2, p1, p2"),
+        ("camera_type", json!("Fisheye"), "OPENCV_FISHEYE"),
+        ("distortion_model", json!("equidistant"), "OPENCV_FISHEYE"),
+        (
+            "projection",
+            json!("EQUIRECTANGULAR"),
+            "camera_model OPENCV_FISHEYE, another fisheye model or EQUIRECTANGULAR",
+        ),
         ("black_transparent", json!("True"), "write the transparency into the images; remove it to ignore it"),
     ] {
         fails(|d| d[name] = value.clone(), &[&format!("`{name}`: is "), hint, "which raygrad does not read"]);
@@ -442,6 +454,21 @@ fn unsupported_camera_fields_are_named() {
             assert_eq!(cameras(|d| d[name] = nothing), cameras(|_| {}), "{name}");
         }
     }
+}
+
+/// Kinds of cameras that have no effect: usual ones, and those beside the camera model.
+#[test]
+fn usual_kinds_of_cameras_are_ignored() {
+    let plain = cameras(|_| {});
+    for (name, value) in [
+        ("camera_type", json!("perspective")),
+        ("projection", json!("pinhole")),
+        ("distortion_model", json!("plumb_bob")),
+    ] {
+        assert_eq!(cameras(|d| d[name] = value), plain, "{name}");
+    }
+    let named = json!({ "camera_type": "fisheye", "camera_model": "OPENCV_FISHEYE" });
+    assert!(matches!(cameras(|d| set(d, &named))[0].lens, Lens::Fisheye { .. }));
 }
 
 #[test]
