@@ -228,16 +228,22 @@ pub fn softmax_rows_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], n: usize, out: &m
         simd::dispatch(
             #[inline(always)]
             || {
-                for (i, out) in out.chunks_exact_mut(n).enumerate() {
-                    let [x, y, g] = [x, y, g].map(|x| &x[i * n..][..n]);
+                let largest = fold_lanes(
+                    g,
+                    #[inline(always)]
+                    |a, b| if b.abs() > a.abs() { b } else { a },
+                );
+                let may_lift = largest.abs() > T::ONE;
+                let rows = y.chunks_exact(n).zip(g.chunks_exact(n)).zip(out.chunks_exact_mut(n));
+                for (i, ((y, g), out)) in rows.enumerate() {
                     let [mean] = totals_of(
                         y,
                         g,
                         #[inline(always)]
                         |y, g| [y * g],
                     );
-                    if lifts(top(g), y) || lifts(bottom(g), y) || !(mean.abs() <= largest_mean) {
-                        large_softmax_grad(x, g, out);
+                    if may_lift && (lifts(top(g), y) || lifts(bottom(g), y)) || !(mean.abs() <= largest_mean) {
+                        large_softmax_grad(&x[i * n..][..n], g, out);
                         continue;
                     }
                     for i in 0..n {
