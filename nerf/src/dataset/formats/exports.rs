@@ -49,6 +49,9 @@ const MESHROOM: Export = ("a scene of Meshroom", "convert it with `aliceVision_e
 const SPLATS: Export = ("an output of 3D Gaussian Splatting", "name the capture that it was trained on");
 const MVSNET: Export = ("a dataset of MVSNet", "write its cameras as transforms.json");
 
+/// A capture under a name that raygrad does not look for.
+const UNUSUAL: Export = ("of the form of transforms.json", "name that file");
+
 /// Ends of the names of files of other programs.
 const ENDINGS: [(&str, Export); 7] = [
     (".psx", METASHAPE),
@@ -66,7 +69,7 @@ const CONTENTS: [(&str, &[&str], Export); 5] = [
     ("csv", &["name,x,y,alt"], REALITY),
     ("json", &["\"img_name\"", "\"rotation\""], SPLATS),
     ("json", &["\"views\"", "\"intrinsics\"", "\"version\""], MESHROOM),
-    ("json", &["\"frames\"", "\"transform_matrix\""], ("of the form of transforms.json", "name that file")),
+    ("json", &["\"frames\"", "\"transform_matrix\""], UNUSUAL),
 ];
 
 /// Folders whose files are examined besides those of the capture.
@@ -92,10 +95,10 @@ pub(super) fn of_folder(folder: &Path) -> Option<String> {
     }
     let named = FOLDERS.map(|name| folder.join(name));
     let found = [folder].into_iter().chain(named.iter().map(PathBuf::as_path)).find_map(|place| {
-        let (file, export) =
-            files(place).into_iter().find_map(|file| Some((program_of(&file)?, file))).map(|(a, b)| (b, a))?;
-        let inside = file.strip_prefix(folder).unwrap_or(&file).display().to_string();
-        Some(format!("holds `{inside}`, which is {} and which raygrad does not read: {}", export.0, export.1))
+        let ((what, remedy), file) = files(place).into_iter().find_map(|file| Some((program_of(&file)?, file)))?;
+        let inside = file.strip_prefix(folder).unwrap_or(&file).display();
+        let unread = if (what, remedy) == UNUSUAL { "" } else { " and which raygrad does not read" };
+        Some(format!("holds `{inside}`, which is {what}{unread}: {remedy}"))
     });
     found.or_else(|| ["sparse/0", "sparse", ""].iter().find_map(|place| half_a_model(folder, place)))
 }
@@ -112,10 +115,8 @@ pub(super) fn below(folder: &Path) -> Option<(PathBuf, String)> {
 /// What is wrong with a file of another program.
 pub(super) fn of_file(file: &Path) -> Option<String> {
     let name = file.file_name()?.to_str()?;
-    let is_named = |(known, ..): &&(&str, &str, &str)| known.rsplit('/').next() == Some(name);
-    let named = EXPORTS.iter().find(is_named).map(|(_, what, remedy)| (*what, *remedy));
-    let is_capture = |export: &Export| CONTENTS.last().is_some_and(|last| last.2 == *export);
-    named.or_else(|| program_of(file).filter(|export| !is_capture(export))).map(unread)
+    let named = EXPORTS.iter().find(|(known, ..)| *known == name).map(|(_, what, remedy)| (*what, *remedy));
+    named.or_else(|| program_of(file).filter(|export| *export != UNUSUAL)).map(unread)
 }
 
 /// The files in a folder, in the order of their names.

@@ -43,7 +43,8 @@ fn exports_under_other_names_are_known_by_their_ending_or_content() {
         assert!(file.contains("which raygrad does not read") && file.contains(what), "{file}");
     }
     let [folder, ..] = messages("scene.json", frames);
-    assert!(folder.contains("`scene.json`") && folder.ends_with("name that file"), "{folder}");
+    let expected = "holds `scene.json`, which is of the form of transforms.json: name that file";
+    assert!(folder.ends_with(expected), "{folder}");
 }
 
 #[test]
