@@ -223,7 +223,30 @@ pub fn sum_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -> Tens
         panic!("cannot sum {:?} to {shape:?}", x.shape())
     };
     let kept: Shape = std::iter::repeat_n(1, lead).chain(shape.iter().copied()).collect();
-    sum_kept(x, &kept, pool).reshape(shape)
+    let sum = sum_kept(x, &kept, pool).reshape(shape);
+    if sum.len() == x.len() || sum.is_finite() { sum } else { far_sum(x, sum, &kept, pool) }
+}
+
+/// `sum`, and the sums of smaller numbers where it is not finite: partial sums may be out of range where the whole is not.
+#[cold]
+#[inline(never)]
+fn far_sum<T: Scalar>(x: &Tensor<T>, sum: Tensor<T>, kept: &[usize], pool: &Pool<T>) -> Tensor<T> {
+    // Half the reciprocal of the count, rounded down to a power of two: no sum of such products overflows.
+    let [down, up] = powers(T::from_f64(2.0 * x.len() as f64 / sum.len().max(1) as f64));
+    let small = map(
+        [x],
+        pool,
+        #[inline(always)]
+        |[x]| x * down,
+    );
+    let small = sum_kept(&small, kept, pool).reshape(sum.shape());
+    // Other sums have their digits, which small elements lose.
+    map(
+        [&sum, &small],
+        pool,
+        #[inline(always)]
+        |[sum, small]| if sum.is_finite() { sum } else { small * up },
+    )
 }
 
 /// The mean over the axes along which `shape` broadcasts to the shape of `x`; NaN for no elements. It overflows only if

@@ -262,6 +262,7 @@ fn losses() -> Vec<Entry> {
     let cross_entropy = |classes: &[u32]| Entry::new(loss::CrossEntropy { classes: classes.into() });
     vec![
         Entry::new(loss::MeanLoss(loss::SquaredError)).sample(&[&[2, 3], &[2, 3], &[2, 3]]).sample(&[&[], &[], &[]]),
+        Entry::new(loss::MeanCrossEntropy { classes: [2, 0, 2].into() }).sample(&[&[3], &[3, 4]]),
         cross_entropy(&[2, 0, 2]).sample(&[&[3, 4]]).sample(&[&[3, 40]]).sample(&[&[1, 3, 3]]),
         cross_entropy(&[1]).sample(&[&[2]]),
         cross_entropy(&[]).sample(&[&[0, 3]]),

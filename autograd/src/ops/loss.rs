@@ -1,13 +1,15 @@
 //! Losses between predictions and targets.
 
+use super::arithmetic::Alias;
 use super::softmax::softmax_times;
 use crate::cases::INF;
 use crate::error::ensure;
+use crate::formula::Elementwise;
 use crate::slopes::{checked, product_over, scaled_difference, softplus_slope, within};
 use crate::{Axes, Cases, Formula, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
 use raygrad_tensor::scale::power_of_two;
-use raygrad_tensor::{Indices, Mask, Pool, Real, Scalar, Shape, Tensor, mean_to};
+use raygrad_tensor::{Indices, Mask, Pool, Real, Scalar, Shape, Tensor, map, mean_to};
 use std::sync::Arc;
 
 /// y = (a - b)^2; da = 2 g (a - b), db = -da.
@@ -223,12 +225,50 @@ impl<T: Scalar> Op<T> for CrossEntropy {
     }
 }
 
-/// y = the mean of the elements of a loss, given these and its operands; the gradient of an element is g / n. Where that
-/// is a subnormal number, which has lost digits, the gradients of the operands follow from a multiple of it.
+/// A loss of each element with a [`MeanLoss`].
+pub trait ElementLoss: Formula<2> {
+    /// The loss of both operands times `down`, a power of two, and the degree `d` for which that is this loss times
+    /// `down^d`. `None` if no loss of finite operands overflows.
+    fn shrunk(self, down: f64) -> Option<(Self, usize)>;
+}
+
+impl ElementLoss for SquaredError {
+    fn shrunk(self, _down: f64) -> Option<(Self, usize)> {
+        Some((self, 2))
+    }
+}
+
+impl ElementLoss for AbsoluteError {
+    fn shrunk(self, _down: f64) -> Option<(Self, usize)> {
+        Some((self, 1))
+    }
+}
+
+impl ElementLoss for Huber {
+    fn shrunk(self, down: f64) -> Option<(Self, usize)> {
+        Some((Huber { delta: self.delta * down }, 2))
+    }
+}
+
+impl ElementLoss for SmoothL1 {
+    fn shrunk(self, down: f64) -> Option<(Self, usize)> {
+        Some((SmoothL1 { beta: self.beta * down }, 1))
+    }
+}
+
+impl ElementLoss for BinaryCrossEntropy {
+    fn shrunk(self, _down: f64) -> Option<(Self, usize)> {
+        None
+    }
+}
+
+/// y = the mean of the elements of a loss, given these and its operands; the gradient of an element is g / n. Where the
+/// loss of an element overflows and the mean does not, the mean follows from the operands. Where g / n is a subnormal
+/// number, which has lost digits, the gradients of the operands follow from a multiple of it.
 #[derive(Clone, Copy)]
 pub struct MeanLoss<F>(pub F);
 
-impl<T: Scalar, F: Formula<2>> Op<T> for MeanLoss<F> {
+impl<T: Scalar, F: ElementLoss> Op<T> for MeanLoss<F> {
     fn name(&self) -> &'static str {
         "mean_loss"
     }
@@ -238,7 +278,21 @@ impl<T: Scalar, F: Formula<2>> Op<T> for MeanLoss<F> {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        mean_to(x[0], &[], pool)
+        let mean = mean_to(x[0], &[], pool);
+        if mean.is_finite() || !x[1..].iter().all(|operand| operand.is_finite()) {
+            return mean;
+        }
+        // The square of a residual times the first is in range, and a residual times the second.
+        let of_squares = if size_of::<T>() == 4 { -70 } else { -520 };
+        let of_degree = |degree: usize| power_of_two(if degree == 2 { of_squares } else { -2 });
+        let Some((_, degree)) = self.0.shrunk(1.0) else { return mean };
+        let down = of_degree(degree);
+        let Some((loss, _)) = self.0.shrunk(down) else { return mean };
+        let [down, up] = [down, down.recip()].map(T::from_f64);
+        let times = |x: &Tensor<T>, by: T| map([x], pool, |[x]| x * by);
+        let [a, b] = [1, 2].map(|i| times(x[i], down));
+        let small = mean_to(&Elementwise(loss).forward(&[&a, &b], pool), &[], pool);
+        (0..degree).fold(small, |mean, _| times(&mean, up))
     }
 
     fn reads(&self) -> Reads {
@@ -253,10 +307,11 @@ impl<T: Scalar, F: Formula<2>> Op<T> for MeanLoss<F> {
         if g.item() == T::ZERO || !(share.item().abs() < T::from_f64(least)) {
             return Grads::new([Some(share.broadcast_to(shape)), None, None]);
         }
-        // Of variables on the same tape, or on one of its own.
+        // Of variables on the same tape, or on one of its own. On the same, as new nodes: one may depend on the other.
         let [a, b] = [1, 2].map(|i| cx.x(i));
         let [da, db] = if cx.recording() {
-            gradients(self.0, [&a.tracked(), &b.tracked()], g.clone(), [up, n])
+            let [a, b] = [a, b].map(|x| Alias.on([&x.tracked()]));
+            gradients(self.0, [&a, &b], g.clone(), [up, n])
         } else {
             let tape = cx.tape().nested();
             let [a, b] = [a, b].map(|x| tape.leaf(x.value().clone()));
@@ -287,15 +342,52 @@ fn gradients<'t, T: Scalar, F: Formula<2>>(
     })
 }
 
-/// `mean`, a mean of `n` losses. Where that is out of range, it is the mean of `scaled(up)`, which is the loss divided by
-/// `up`, times `up`: a power of two of at least `n`.
-#[track_caller]
-fn in_range<'t, T: Scalar>(mean: Var<'t, T>, n: usize, scaled: impl FnOnce(f64) -> Var<'t, T>) -> Var<'t, T> {
-    if mean.item().is_finite() {
-        return mean;
+/// y = the mean of the [cross-entropies](CrossEntropy) of rows, given these and the logits; the gradient of a row is
+/// g / n. Where the loss of a row overflows and the mean does not, the mean follows from the logits.
+#[derive(Clone)]
+pub struct MeanCrossEntropy {
+    /// The class of each row.
+    pub classes: Arc<[u32]>,
+}
+
+impl<T: Scalar> Op<T> for MeanCrossEntropy {
+    fn name(&self) -> &'static str {
+        "mean_cross_entropy"
     }
-    let up = n.next_power_of_two() as f64;
-    scaled(up).mean() * up
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let losses = Op::<T>::shape(&CrossEntropy { classes: self.classes.clone() }, &x[1..])?;
+        if x[0] == losses.as_slice() { Ok(Shape::new()) } else { Err("not one loss for each row".into()) }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let (mean, [losses, logits]) = (mean_to(x[0], &[], pool), [x[0], x[1]]);
+        if mean.is_finite() || !logits.is_finite() {
+            return mean;
+        }
+        let [down, up] = [0.25, 4.0].map(T::from_f64);
+        let mut small = losses.clone();
+        let rows = logits.as_slice().chunks_exact(logits.len() / losses.len().max(1));
+        for ((loss, row), &class) in small.as_mut_slice().iter_mut().zip(rows).zip(self.classes.iter()) {
+            // Beside a difference that overflows, the logarithm of the sum is that of its largest term.
+            let most = || row.iter().copied().reduce(Real::maximum).unwrap_or(T::ZERO);
+            *loss = if loss.is_finite() { *loss * down } else { most() * down - row[class as usize] * down };
+        }
+        map([&mean_to(&small, &[], pool)], pool, |[mean]| mean * up)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let shape = cx.shape(0);
+        Grads::new([Some((cx.g() / shape.iter().product::<usize>() as f64).broadcast_to(shape)), None])
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        Some(x[0].mean())
+    }
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
@@ -310,9 +402,10 @@ impl<'t, T: Scalar> Var<'t, T> {
 
     /// The mean of a loss of each element.
     #[track_caller]
-    fn mean_loss<F: Formula<2>>(&self, loss: F, target: &Self) -> Self {
-        let losses = self.loss(loss, target);
-        self.tape().apply(MeanLoss(loss), &[&losses, self, target])
+    fn mean_loss(&self, loss: impl ElementLoss, target: impl Operand<'t, T>) -> Self {
+        let target = target.on(self.tape());
+        let losses = self.loss(loss, &target);
+        self.tape().apply(MeanLoss(loss), &[&losses, self, &target])
     }
 
     /// The squared error of each element, `(self - target)^2`.
@@ -330,12 +423,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ.
     #[track_caller]
     pub fn mse_loss(&self, target: impl Operand<'t, T>) -> Self {
-        let target = target.on(self.tape());
-        let scaled = |up: f64| {
-            let r = self - &target;
-            &r * (&r / up)
-        };
-        in_range(self.mean_loss(SquaredError, &target), self.value().len(), scaled)
+        self.mean_loss(SquaredError, target)
     }
 
     /// The absolute error of each element, `|self - target|`. The gradient at equality is 0.
@@ -353,9 +441,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ.
     #[track_caller]
     pub fn l1_loss(&self, target: impl Operand<'t, T>) -> Self {
-        let target = target.on(self.tape());
-        let scaled = |up: f64| (self / up - &target / up).abs();
-        in_range(self.mean_loss(AbsoluteError, &target), self.value().len(), scaled)
+        self.mean_loss(AbsoluteError, target)
     }
 
     /// The Huber loss of each element. With `r = self - target` it is `r^2 / 2` for `|r| <= delta`, and
@@ -380,18 +466,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// Where [`huber`](Self::huber) panics.
     #[track_caller]
     pub fn huber_loss(&self, target: impl Operand<'t, T>, delta: f64) -> Self {
-        let target = target.on(self.tape());
-        let scaled = |up: f64| self.scaled_huber(&target, delta, up) * delta;
-        in_range(self.mean_loss(self.huber_of(delta), &target), self.value().len(), scaled)
-    }
-
-    /// `smooth_l1 / up` for a `beta` above 0, with the division before the difference.
-    #[track_caller]
-    fn scaled_huber(&self, target: &Self, beta: f64, up: f64) -> Self {
-        // With m, the smaller of |r| and beta: m / beta (|r| - m / 2).
-        let m = (self - target).abs().minimum(self.constant(beta));
-        let above = (self / up - target / up).abs() - &m * (0.5 / up);
-        m / beta * above
+        self.mean_loss(self.huber_of(delta), target)
     }
 
     /// The Huber loss divided by `beta`, of each element: the slope is 1 beyond `beta`. For `beta` 0 it is the absolute
@@ -416,12 +491,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// Where [`smooth_l1`](Self::smooth_l1) panics.
     #[track_caller]
     pub fn smooth_l1_loss(&self, target: impl Operand<'t, T>, beta: f64) -> Self {
-        let target = target.on(self.tape());
-        let scaled = |up: f64| match T::from_f64(beta) == T::ZERO {
-            true => (self / up - &target / up).abs(),
-            false => self.scaled_huber(&target, beta, up),
-        };
-        in_range(self.mean_loss(self.smooth_l1_of(beta), &target), self.value().len(), scaled)
+        self.mean_loss(self.smooth_l1_of(beta), target)
     }
 
     /// The binary cross-entropy of each element, from logits: `-t ln s - (1 - t) ln(1 - s)`. Here `s` is the
@@ -441,7 +511,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ.
     #[track_caller]
     pub fn binary_cross_entropy_with_logits_loss(&self, target: impl Operand<'t, T>) -> Self {
-        self.mean_loss(BinaryCrossEntropy, &target.on(self.tape()))
+        self.mean_loss(BinaryCrossEntropy, target)
     }
 
     /// The cross-entropy of each row of logits, `-ln softmax(row)[class]`: `[.., n]` to `[..]`. `classes` has one class
@@ -476,16 +546,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn cross_entropy_loss(&self, classes: impl Into<Indices>) -> Self {
         let classes = classes.into();
-        let loss = self.cross_entropy(classes.clone());
-        in_range(loss.mean(), loss.value().len(), |up| {
-            // The logarithm of a row and the logit are in range where their difference is not.
-            let shape = loss.shape();
-            let mut column = Shape::from_slice(shape);
-            column.push(1);
-            let logits = self.gather(-1, Indices::new(&column, classes.values().clone())).reshape(shape);
-            let is_in_range = Mask::new(shape, loss.value().iter().map(|y| y.is_finite()).collect::<Vec<_>>());
-            (&loss / up).where_(&is_in_range, self.logsumexp_over(-1) / up - logits / up)
-        })
+        let losses = self.cross_entropy(classes.clone());
+        self.tape().apply(MeanCrossEntropy { classes: classes.values().clone() }, &[&losses, self])
     }
 }
 

@@ -33,6 +33,7 @@ pub(crate) mod activation;
 pub(crate) mod arithmetic;
 pub(crate) mod arrange;
 pub(crate) mod convolution;
+mod double;
 pub(crate) mod einsum;
 pub(crate) mod exponential;
 pub(crate) mod extremum;

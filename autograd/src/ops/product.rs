@@ -1,15 +1,16 @@
 //! The product of the elements of each row, without overflow or underflow of partial products.
 
+use super::double::Double;
 use super::gradient_op::{FusedGradient, GradientOp};
 use super::scan::{Cumprod, Running, Walk};
 use crate::{Axes, Grads, Op, ShapeError, Var, Vjp};
 use raygrad_tensor::scale::power_of_two;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, simd};
 
 /// y = the product of each row (along the last axis); dx = g times the product of all others.
 ///
-/// Products use [`balanced`] factors. So a value or gradient in the range of the type is right, even if partial
-/// products are out of range.
+/// Products use [`balanced`] factors, in [`Double`] numbers. So a value or gradient in the range of the type is right,
+/// even if partial products are out of range or the row is long.
 #[derive(Clone, Copy)]
 pub struct Product;
 
@@ -27,11 +28,21 @@ impl<T: Scalar> Op<T> for Product {
         let axes = x[0].ndim() - 1;
         let mut out = pool.full(&x[0].shape()[..axes], T::ONE);
         let n = x[0].shape()[axes];
-        for (x, out) in x[0].as_slice().chunks_exact(n.max(1)).zip(out.as_mut_slice()) {
-            let (mut product, mut total) = (1.0, 0);
-            balanced(x, |_, factor, exponent| (product, total) = (product * factor, total + exponent));
-            *out = T::from_f64(scaled(product, 1.0, total));
-        }
+        let rows = x[0].as_slice().chunks_exact(n.max(1)).zip(out.as_mut_slice());
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                for (x, out) in rows {
+                    let (mut product, mut total) = (Double::from(1.0), 0);
+                    balanced(
+                        x,
+                        #[inline(always)]
+                        |_, factor, exponent| (product, total) = (product.times(factor), total + exponent),
+                    );
+                    *out = T::from_f64(scaled(product.value(), 1.0, total));
+                }
+            },
+        );
         out
     }
 
@@ -51,7 +62,8 @@ impl<T: Scalar> FusedGradient<T> for Product {
         for ((x, out), &g) in rows.zip(g.as_slice()) {
             others.of(x);
             for (i, out) in out.iter_mut().enumerate() {
-                *out = T::from_f64(scaled(others.products[i], g.to_f64(), others.total - others.exponents[i]));
+                let product = others.products[i].value();
+                *out = T::from_f64(scaled(product, g.to_f64(), others.total - others.exponents[i]));
             }
         }
         out
@@ -70,7 +82,8 @@ fn recorded<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
     let mut powers: [Vec<T>; 4] = Default::default();
     for row in x.value().as_slice().chunks_exact(shape[axis].max(1)) {
         others.of(row);
-        for (&product, &exponent) in others.products.iter().zip(&others.exponents) {
+        for (product, &exponent) in others.products.iter().zip(&others.exponents) {
+            let product = product.value();
             let is_ordinary = product != 0.0 && product.is_finite();
             let [to_balanced, back] = [halves(-exponent), halves(others.total - exponent)];
             // A limit where 0 times infinity, or infinity times 0, would come of it.
@@ -96,34 +109,39 @@ fn recorded<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
 #[derive(Default)]
 struct Others {
     factors: Vec<f64>,
-    products: Vec<f64>,
+    products: Vec<Double>,
     exponents: Vec<i64>,
     total: i64,
 }
 
 impl Others {
     fn of<T: Scalar>(&mut self, row: &[T]) {
-        for list in [&mut self.factors, &mut self.products] {
-            list.resize(row.len(), 0.0);
-        }
+        self.factors.resize(row.len(), 0.0);
+        self.products.resize(row.len(), Double::from(0.0));
         self.exponents.resize(row.len(), 0);
         balanced(row, |i, factor, exponent| (self.factors[i], self.exponents[i]) = (factor, exponent));
         self.total = self.exponents.iter().sum();
-        let mut behind = 1.0;
-        for (product, factor) in self.products.iter_mut().zip(&self.factors).rev() {
-            *product = behind;
-            behind *= factor;
-        }
-        let mut before = 1.0;
-        for (product, factor) in self.products.iter_mut().zip(&self.factors) {
-            *product *= before;
-            before *= factor;
-        }
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let mut behind = Double::from(1.0);
+                for (product, &factor) in self.products.iter_mut().zip(&self.factors).rev() {
+                    *product = behind;
+                    behind = behind.times(factor);
+                }
+                let mut before = Double::from(1.0);
+                for (product, &factor) in self.products.iter_mut().zip(&self.factors) {
+                    *product = before.product(*product);
+                    before = before.times(factor);
+                }
+            },
+        );
     }
 }
 
 /// Calls `f(i, factor, exponent)` with each element as `factor * 2^exponent`. The product of any run of neighbouring
 /// factors is between 1/2 and 2. Zeros, infinities and NaN stay unchanged and do not count.
+#[inline(always)]
 fn balanced<T: Scalar>(row: &[T], mut f: impl FnMut(usize, f64, i64)) {
     // The product of all factors so far, in 1..2.
     let mut product = 1.0;
@@ -159,14 +177,14 @@ fn split(x: f64) -> (f64, i64) {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Unbounded {
     /// Between 2^-400 and 2^400, unless it is 0 or not finite.
-    factor: f64,
+    factor: Double,
     exponent: i64,
 }
 
 impl From<f64> for Unbounded {
     #[inline(always)]
     fn from(x: f64) -> Self {
-        Unbounded { factor: 1.0, exponent: 0 }.times(x)
+        Unbounded { factor: Double::from(1.0), exponent: 0 }.times(x)
     }
 }
 
@@ -179,27 +197,41 @@ impl Unbounded {
 
     #[inline(never)]
     fn times_any(self, x: f64) -> Self {
-        if is_special(self.factor) || is_special(x) {
-            return Unbounded { factor: self.factor * x, exponent: 0 };
+        if is_special(self.factor.value()) || is_special(x) {
+            return Unbounded { factor: Double::from(self.factor.value() * x), exponent: 0 };
         }
-        let ((a, up), (b, up_too)) = (split(self.factor), split(x));
-        Unbounded { factor: a * b, exponent: self.exponent + up + up_too }
+        let ((a, up), (b, up_too)) = (self.split(), split(x));
+        Unbounded { factor: a.times(b), exponent: up + up_too }
+    }
+
+    /// The factor in 1..2, up to its sign, and the exponent that belongs to it.
+    fn split(self) -> (Double, i64) {
+        let (_, up) = split(self.factor.value());
+        (self.factor.scaled(power_of_two(-up)), self.exponent + up)
+    }
+
+    /// The product of two numbers.
+    pub fn product_of(a: f64, b: f64) -> Self {
+        Unbounded::from(a).times(b)
+    }
+
+    /// The difference.
+    pub fn minus(self, other: Self) -> Self {
+        self.plus(Unbounded { factor: other.factor.scaled(-1.0), ..other })
     }
 
     #[inline(never)]
     fn plus_any(self, other: Self) -> Self {
-        match (is_special(self.factor), is_special(other.factor)) {
-            (true, true) => return Unbounded { factor: self.factor + other.factor, exponent: 0 },
-            (true, false) => return if self.factor == 0.0 { other } else { self },
-            (false, true) => return if other.factor == 0.0 { self } else { other },
+        let [a, b] = [self, other].map(|x| x.factor.value());
+        match (is_special(a), is_special(b)) {
+            (true, true) => return Unbounded { factor: Double::from(a + b), exponent: 0 },
+            (true, false) => return if a == 0.0 { other } else { self },
+            (false, true) => return if b == 0.0 { self } else { other },
             (false, false) => {}
         }
-        let [(a, up), (b, up_too)] = [self, other].map(|x| {
-            let (factor, exponent) = split(x.factor);
-            (factor, exponent + x.exponent)
-        });
+        let [(a, up), (b, up_too)] = [self, other].map(Unbounded::split);
         let most = up.max(up_too);
-        let sum = a * power_of_two(up - most) + b * power_of_two(up_too - most);
+        let sum = a.scaled(power_of_two(up - most)).plus(b.scaled(power_of_two(up_too - most)));
         Unbounded { factor: sum, exponent: most }
     }
 }
@@ -207,18 +239,26 @@ impl Unbounded {
 impl Running for Unbounded {
     #[inline(always)]
     fn times(self, x: f64) -> Self {
-        let factor = self.factor * x;
-        if Unbounded::is_in_the_middle(factor) { Unbounded { factor, ..self } } else { self.times_any(x) }
+        let factor = self.factor.times(x);
+        if Unbounded::is_in_the_middle(factor.value()) { Unbounded { factor, ..self } } else { self.times_any(x) }
     }
     #[inline(always)]
     fn product(self, other: Self) -> Self {
-        let product = self.times(other.factor);
-        Unbounded { exponent: product.exponent + other.exponent, ..product }
+        let factor = self.factor.product(other.factor);
+        if Unbounded::is_in_the_middle(factor.value()) {
+            return Unbounded { factor, exponent: self.exponent + other.exponent };
+        }
+        let [a, b] = [self, other].map(|x| x.factor.value());
+        if is_special(a) || is_special(b) {
+            return Unbounded { factor: Double::from(a * b), exponent: 0 };
+        }
+        let [(a, up), (b, up_too)] = [self, other].map(Unbounded::split);
+        Unbounded { factor: a.product(b), exponent: up + up_too }
     }
     #[inline(always)]
     fn plus(self, other: Self) -> Self {
-        let factor = self.factor + other.factor;
-        if self.exponent == other.exponent && Unbounded::is_in_the_middle(factor) {
+        let factor = self.factor.plus(other.factor);
+        if self.exponent == other.exponent && Unbounded::is_in_the_middle(factor.value()) {
             Unbounded { factor, ..self }
         } else {
             self.plus_any(other)
@@ -226,7 +266,7 @@ impl Running for Unbounded {
     }
     #[inline(always)]
     fn value(self) -> f64 {
-        if self.exponent == 0 { self.factor } else { scaled(self.factor, 1.0, self.exponent) }
+        if self.exponent == 0 { self.factor.value() } else { scaled(self.factor.value(), 1.0, self.exponent) }
     }
     #[inline(always)]
     fn is_in_range(self) -> bool {

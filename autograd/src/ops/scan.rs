@@ -1,5 +1,6 @@
 //! Cumulative sums and products, and the recurrence in their derivatives.
 
+use super::double::Double;
 use super::gradient_op::{FusedGradient, GradientOp, has_far};
 use super::product::Unbounded;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
@@ -204,8 +205,11 @@ impl Running for f64 {
 }
 
 impl Walk {
-    /// Whether no product of `x` is in the range of `T` after one has left that of f64.
+    /// Whether no product of `x` is in the range of f32 after one has left that of f64; false for f64.
     fn stays_in_range<T: Scalar>(self, shape: &[usize], x: &[T]) -> bool {
+        if const { size_of::<T>() == size_of::<f64>() } {
+            return false;
+        }
         // The order of positive numbers is that of their bits. Signed, which vectors compare.
         let sizes = simd::dispatch(
             #[inline(always)]
@@ -231,81 +235,151 @@ impl Walk {
         );
         let [least, most] = sizes.map(|bits| f64::from_bits(bits as u64));
         // A product that only falls below the range of f64 stays below that of f32.
-        T::EPSILON > 1e-10 && most <= 1.0 || shape[self.axis] as f64 * most.log2().abs().max(least.log2().abs()) < 700.0
+        let is_near_one = |size: f64| shape[self.axis] as f64 * size.log2().abs() < 700.0;
+        most <= 1.0 || is_near_one(most) && is_near_one(least)
     }
+}
 
-    /// The product of `x` up to each entry, in `y`. Whether all are right, if it is `CHECKED`.
-    fn products<const CHECKED: bool, S: Running, T: Scalar>(self, shape: &[usize], x: &[T], y: &mut [T]) -> bool {
-        let mut are_right = true;
-        self.run(shape, S::from(1.0), |product, i| {
-            let x = x[i].to_f64();
-            let is_zero = !CHECKED || x == 0.0 || product.value() == 0.0;
-            *product = product.times(x);
-            are_right &= is_zero || product.is_in_range();
-            y[i] = T::from_f64(product.value());
-        });
-        are_right
+/// A scan of running numbers.
+trait Pass {
+    /// Runs the scan. Returns whether all numbers are right, if it is `CHECKED`.
+    fn run<const CHECKED: bool, S: Running>(&mut self) -> bool;
+}
+
+/// Runs a scan of `T`, with more digits than `T` has, and in [`Unbounded`] numbers if others leave the range of f64.
+/// If `stays_in_range`, none leaves it.
+fn run_in_range<T: Scalar>(stays_in_range: bool, pass: &mut impl Pass) {
+    let is_right = if stays_in_range {
+        pass.run::<false, f64>()
+    } else if const { size_of::<T>() == size_of::<f32>() } {
+        pass.run::<true, f64>()
+    } else {
+        simd::dispatch(
+            #[inline(always)]
+            || pass.run::<true, Double>(),
+        )
+    };
+    if !(is_right || stays_in_range) {
+        pass.run::<false, Unbounded>();
     }
+}
 
-    /// The gradient by the factors of the [`Running`] numbers that begin with `start`, get the factors `x` and then the
-    /// summands `b`, if there are any; in `dx`. Whether all are right, if it is `CHECKED`.
-    fn factors_grad<const CHECKED: bool, S: Running, T: Scalar>(
-        self,
-        shape: &[usize],
-        [x, g]: [&[T]; 2],
-        (start, b): (f64, Option<&[T]>),
-        dx: &mut [T],
-    ) -> bool {
-        let (mut later, mut are_right) = (vec![S::from(0.0); x.len()], true);
-        // The gradient of the number at entry i, times the factor there.
-        self.back().run(shape, S::from(0.0), |sum, i| {
-            let (x, g) = (x[i].to_f64(), g[i].to_f64());
-            later[i] = sum.plus(S::from(g));
-            are_right &= !CHECKED || (g == 0.0 && sum.value() == 0.0) || later[i].is_in_range();
-            let is_zero = !CHECKED || x == 0.0 || later[i].value() == 0.0;
-            *sum = later[i].times(x);
-            are_right &= is_zero || sum.is_in_range();
-        });
-        self.run(shape, S::from(start), |before, i| {
-            let x = x[i].to_f64();
-            dx[i] = T::from_f64(before.product(later[i]).value());
-            let is_zero = !CHECKED || x == 0.0 || before.value() == 0.0;
-            *before = before.times(x);
-            are_right &= is_zero || before.is_in_range();
-            if let Some(b) = b {
-                let b = b[i].to_f64();
-                let is_zero = !CHECKED || b == 0.0;
-                *before = before.plus(S::from(b));
-                are_right &= is_zero || before.is_in_range();
-            }
-        });
-        are_right
-    }
+/// The product of `x` up to each entry, in `y`.
+struct Products<'a, T> {
+    walk: Walk,
+    shape: &'a [usize],
+    x: &'a [T],
+    y: &'a mut [T],
+}
 
-    /// The [`Recurrence`] of the factors `a` and the summands `b`, in `y`. Whether all are right, if it is `CHECKED`.
-    fn recurrence<const CHECKED: bool, S: Running, T: Scalar>(
-        self,
-        shape: &[usize],
-        [a, b]: [&[T]; 2],
-        y: &mut [T],
-    ) -> bool {
-        let mut are_right = true;
-        self.run(shape, S::from(0.0), |state, i| {
-            let (a, b) = (a[i].to_f64(), b[i].to_f64());
-            let is_zero = !CHECKED || a == 0.0 || state.value() == 0.0;
-            *state = state.times(a);
-            are_right &= is_zero || state.is_in_range();
-            let is_zero = !CHECKED || b == 0.0;
-            *state = state.plus(S::from(b));
-            are_right &= is_zero || state.is_in_range();
-            y[i] = T::from_f64(state.value());
-        });
+impl<T: Scalar> Pass for Products<'_, T> {
+    #[inline(always)]
+    fn run<const CHECKED: bool, S: Running>(&mut self) -> bool {
+        let (Products { walk, shape, x, y }, mut are_right) = (self, true);
+        walk.run(
+            shape,
+            S::from(1.0),
+            #[inline(always)]
+            |product, i| {
+                let x = x[i].to_f64();
+                let is_zero = !CHECKED || x == 0.0 || product.value() == 0.0;
+                *product = product.times(x);
+                are_right &= is_zero || product.is_in_range();
+                y[i] = T::from_f64(product.value());
+            },
+        );
         are_right
     }
 }
 
-/// y = the product of x up to and including each entry; dx = [`CumprodGrad`] of x and g. Products are in f64, or in
-/// [`Unbounded`] numbers if they leave its range: those in the range of the type are right even if others are not.
+/// The gradient by the factors of the [`Running`] numbers that begin with `start`, get the factors `x` and then the
+/// summands `b`, if there are any; in `dx`.
+struct FactorsGrad<'a, T> {
+    walk: Walk,
+    shape: &'a [usize],
+    x: &'a [T],
+    g: &'a [T],
+    start: f64,
+    b: Option<&'a [T]>,
+    dx: &'a mut [T],
+}
+
+impl<T: Scalar> Pass for FactorsGrad<'_, T> {
+    #[inline(always)]
+    fn run<const CHECKED: bool, S: Running>(&mut self) -> bool {
+        let FactorsGrad { walk, shape, x, g, start, b, dx } = self;
+        let (mut later, mut are_right) = (vec![S::from(0.0); x.len()], true);
+        // The gradient of the number at entry i, times the factor there.
+        walk.back().run(
+            shape,
+            S::from(0.0),
+            #[inline(always)]
+            |sum, i| {
+                let (x, g) = (x[i].to_f64(), g[i].to_f64());
+                later[i] = sum.plus(S::from(g));
+                are_right &= !CHECKED || (g == 0.0 && sum.value() == 0.0) || later[i].is_in_range();
+                let is_zero = !CHECKED || x == 0.0 || later[i].value() == 0.0;
+                *sum = later[i].times(x);
+                are_right &= is_zero || sum.is_in_range();
+            },
+        );
+        walk.run(
+            shape,
+            S::from(*start),
+            #[inline(always)]
+            |before, i| {
+                let x = x[i].to_f64();
+                dx[i] = T::from_f64(before.product(later[i]).value());
+                let is_zero = !CHECKED || x == 0.0 || before.value() == 0.0;
+                *before = before.times(x);
+                are_right &= is_zero || before.is_in_range();
+                if let Some(b) = b {
+                    let b = b[i].to_f64();
+                    let is_zero = !CHECKED || b == 0.0;
+                    *before = before.plus(S::from(b));
+                    are_right &= is_zero || before.is_in_range();
+                }
+            },
+        );
+        are_right
+    }
+}
+
+/// The [`Recurrence`] of the factors `a` and the summands `b`, in `y`.
+struct Recurred<'a, T> {
+    walk: Walk,
+    shape: &'a [usize],
+    a: &'a [T],
+    b: &'a [T],
+    y: &'a mut [T],
+}
+
+impl<T: Scalar> Pass for Recurred<'_, T> {
+    #[inline(always)]
+    fn run<const CHECKED: bool, S: Running>(&mut self) -> bool {
+        let (Recurred { walk, shape, a, b, y }, mut are_right) = (self, true);
+        walk.run(
+            shape,
+            S::from(0.0),
+            #[inline(always)]
+            |state, i| {
+                let (a, b) = (a[i].to_f64(), b[i].to_f64());
+                let is_zero = !CHECKED || a == 0.0 || state.value() == 0.0;
+                *state = state.times(a);
+                are_right &= is_zero || state.is_in_range();
+                let is_zero = !CHECKED || b == 0.0;
+                *state = state.plus(S::from(b));
+                are_right &= is_zero || state.is_in_range();
+                y[i] = T::from_f64(state.value());
+            },
+        );
+        are_right
+    }
+}
+
+/// y = the product of x up to and including each entry; dx = [`CumprodGrad`] of x and g. Products have more digits than
+/// the type, and are in [`Unbounded`] numbers if they leave the range of f64: those in the range of the type are right
+/// even if others are not.
 #[derive(Clone, Copy)]
 pub struct Cumprod(
     /// The order.
@@ -324,11 +398,7 @@ impl<T: Scalar> Op<T> for Cumprod {
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let mut out = pool.tensor(x[0].shape());
         let (x, y, shape) = (x[0].as_slice(), out.as_mut_slice(), x[0].shape());
-        if self.0.stays_in_range(shape, x) {
-            self.0.products::<false, f64, T>(shape, x, y);
-        } else if !self.0.products::<true, f64, T>(shape, x, y) {
-            self.0.products::<false, Unbounded, T>(shape, x, y);
-        }
+        run_in_range::<T>(self.0.stays_in_range(shape, x), &mut Products { walk: self.0, shape, x, y });
         out
     }
 
@@ -365,13 +435,8 @@ impl<T: Scalar> Op<T> for CumprodGrad {
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let mut out = pool.tensor(x[0].shape());
         let (x, g, dx, shape) = (x[0].as_slice(), x[1].as_slice(), out.as_mut_slice(), x[0].shape());
-        // Gradients in f64 may bring back products that have fallen out of its range; those in f32 may not.
-        let products = (1.0, None);
-        if T::EPSILON > 1e-10 && self.0.stays_in_range(shape, x) {
-            self.0.factors_grad::<false, f64, T>(shape, [x, g], products, dx);
-        } else if !self.0.factors_grad::<true, f64, T>(shape, [x, g], products, dx) {
-            self.0.factors_grad::<false, Unbounded, T>(shape, [x, g], products, dx);
-        }
+        let stays_in_range = self.0.stays_in_range(shape, x);
+        run_in_range::<T>(stays_in_range, &mut FactorsGrad { walk: self.0, shape, x, g, start: 1.0, b: None, dx });
         out
     }
 
@@ -391,7 +456,8 @@ impl<T: Scalar> Op<T> for CumprodGrad {
 }
 
 /// y[i] = a[i] y[i - 1] + b[i], with 0 before the first entry. db: the same recurrence of g in the other direction,
-/// with the next factor; da = db y[i - 1]. Numbers are in f64, or in [`Unbounded`] numbers if they leave its range.
+/// with the next factor; da = db y[i - 1]. Numbers have more digits than the type, and are in [`Unbounded`] numbers if
+/// they leave the range of f64.
 #[derive(Clone, Copy)]
 pub struct Recurrence(
     /// The order.
@@ -413,11 +479,7 @@ impl<T: Scalar> Op<T> for Recurrence {
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let mut out = pool.tensor(x[0].shape());
         let (a, b, y, shape) = (x[0].as_slice(), x[1].as_slice(), out.as_mut_slice(), x[0].shape());
-        if T::EPSILON > 1e-10 && self.0.stays_in_range(shape, a) {
-            self.0.recurrence::<false, f64, T>(shape, [a, b], y);
-        } else if !self.0.recurrence::<true, f64, T>(shape, [a, b], y) {
-            self.0.recurrence::<false, Unbounded, T>(shape, [a, b], y);
-        }
+        run_in_range::<T>(self.0.stays_in_range(shape, a), &mut Recurred { walk: self.0, shape, a, b, y });
         out
     }
 
@@ -449,12 +511,8 @@ impl<T: Scalar> FusedGradient<T> for Recurrence {
     fn gradient(&self, _input: usize, x: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
         let mut out = pool.tensor(x[0].shape());
         let (a, b, da, shape) = (x[0].as_slice(), x[1].as_slice(), out.as_mut_slice(), x[0].shape());
-        let (given, sums) = ([a, g.as_slice()], (0.0, Some(b)));
-        if T::EPSILON > 1e-10 && self.0.stays_in_range(shape, a) {
-            self.0.factors_grad::<false, f64, T>(shape, given, sums, da);
-        } else if !self.0.factors_grad::<true, f64, T>(shape, given, sums, da) {
-            self.0.factors_grad::<false, Unbounded, T>(shape, given, sums, da);
-        }
+        let (walk, g, stays_in_range) = (self.0, g.as_slice(), self.0.stays_in_range(shape, a));
+        run_in_range::<T>(stays_in_range, &mut FactorsGrad { walk, shape, x: a, g, start: 0.0, b: Some(b), dx: da });
         out
     }
 

@@ -1,9 +1,12 @@
 //! Vectors along the last axis: cross product and normalisation.
 
+use super::double::Double;
 use super::gradient_op::{FusedGradient, GradientOp};
+use super::product::Unbounded;
+use super::scan::Running;
 use crate::{Axes, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::scale::{exponent, largest, power_of_two, wide_power};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, Wide, broadcast_shape};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, Wide, broadcast_shape, simd};
 
 /// y = a x b along the last axis of extent 3, with broadcasting; da = b x g, db = g x a.
 #[derive(Clone, Copy)]
@@ -28,11 +31,17 @@ impl<T: Scalar> Op<T> for Cross {
         let (a, b) = (x[0].broadcast_to(&shape), x[1].broadcast_to(&shape));
         let mut out = pool.tensor(&shape);
         let pairs = a.as_slice().chunks_exact(3).zip(b.as_slice().chunks_exact(3));
-        for (y, (a, b)) in out.as_mut_slice().chunks_exact_mut(3).zip(pairs) {
-            y[0] = a[1] * b[2] - a[2] * b[1];
-            y[1] = a[2] * b[0] - a[0] * b[2];
-            y[2] = a[0] * b[1] - a[1] * b[0];
-        }
+        let rows = out.as_mut_slice().chunks_exact_mut(3).zip(pairs);
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                for (y, (a, b)) in rows {
+                    y[0] = difference([a[1], b[2]], [a[2], b[1]]);
+                    y[1] = difference([a[2], b[0]], [a[0], b[2]]);
+                    y[2] = difference([a[0], b[1]], [a[1], b[0]]);
+                }
+            },
+        );
         out
     }
 
@@ -41,6 +50,29 @@ impl<T: Scalar> Op<T> for Cross {
         let db = cx.needs(1).then(|| cx.g().cross(cx.x(0)).sum_to(cx.shape(1)));
         Grads::new([da, db])
     }
+}
+
+/// The difference of two products, to the last digits: products that cancel, overflow or underflow do no harm.
+#[inline(always)]
+fn difference<T: Scalar>(a: [T; 2], b: [T; 2]) -> T {
+    let [a, b] = [a, b].map(|factors| factors.map(T::to_f64));
+    if const { size_of::<T>() == size_of::<f32>() } {
+        return T::from_f64(a[0] * a[1] - b[0] * b[1]);
+    }
+    let products = [a, b].map(|[x, y]| Double::product_of(x, y));
+    let are_right = |product: Double, factors: [f64; 2]| product.is_in_range() || factors.contains(&0.0);
+    if are_right(products[0], a) && are_right(products[1], b) {
+        return T::from_f64(products[0].minus(products[1]).value());
+    }
+    far_difference(a, b)
+}
+
+/// [`difference`] where a product leaves the range.
+#[cold]
+#[inline(never)]
+fn far_difference<T: Scalar>(a: [f64; 2], b: [f64; 2]) -> T {
+    let [a, b] = [a, b].map(|[x, y]| Unbounded::product_of(x, y));
+    T::from_f64(a.minus(b).value())
 }
 
 /// y = x / |x| along the last axis; dx = (g - y (y . g)) / |x|.
@@ -194,7 +226,8 @@ impl<T: Scalar> FusedGradient<T> for Normalize {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The cross product along the last axis, whose extent is 3. Other axes broadcast.
+    /// The cross product along the last axis, whose extent is 3. Other axes broadcast. Differences keep their digits, even
+    /// if products cancel or are out of range.
     ///
     /// # Panics
     /// If a last axis does not have three entries, or the shapes do not broadcast.

@@ -27,7 +27,7 @@ macro_rules! cases {
 }
 
 /// Operations of the catalogue without a reference, and why.
-const WITHOUT: [(&str, &str); 17] = [
+const WITHOUT: [(&str, &str); 18] = [
     ("alias", "the tape's own copy of an input, not callable from outside; it is the identity"),
     ("mul_add", "the exact sum of a product in recorded gradients, not callable from outside; tests of those cover it"),
     ("ratio", "part of the gradients of norm, var and std, not callable from outside; tests of their range cover it"),
@@ -42,6 +42,7 @@ const WITHOUT: [(&str, &str); 17] = [
     ("softmax_grad", "compared as the gradient of softmax"),
     ("mean", "compared as sum.mean"),
     ("mean_loss", "compared as squared_error.mse_loss"),
+    ("mean_cross_entropy", "compared as cross_entropy.mean"),
     ("matmul_left_transposed", "compared as matmul.tn"),
     ("matmul_right_transposed", "compared as matmul.nt"),
     ("matmul_both_transposed", "compared as matmul.tt"),

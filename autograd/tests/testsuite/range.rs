@@ -790,7 +790,73 @@ fn mean_losses_beyond_the_range() {
     }
 }
 
-/// Means of windows, and of gradients of windows that share a pixel, of numbers whose sum is out of range.
+/// An element overflows, and gradients are at the ends of the range.
+#[test]
+fn gradients_beside_a_loss_that_overflows() {
+    /// The gradients by the first operand, plain and recorded.
+    fn gradients<T: Scalar>(
+        loss: impl for<'t> Fn(&Var<'t, T>, &Var<'t, T>) -> Var<'t, T>,
+        [x, target]: [Tensor<T>; 2],
+        g: f64,
+    ) -> (T, [Tensor<T>; 2]) {
+        let tape = Tape::<T>::new();
+        let [x, target] = [x, target].map(|x| tape.leaf(x));
+        let y = loss(&x, &target);
+        let g = tape.constant(Tensor::scalar(T::from_f64(g)));
+        let plain = tape.no_grad(|| y.vjp(&g, &[&x])).remove(0);
+        (y.item(), [plain, y.vjp(&g, &[&x]).remove(0)].map(Var::into_value))
+    }
+    fn check<T: Scalar>(most: T, g: f64, least: f64, [big, small, large]: [f64; 3]) {
+        let of = |values: &[f64]| Tensor::from_vec(&[values.len()], values.iter().map(|&x| T::from_f64(x)).collect());
+        let most = most.to_f64();
+        let operands = || [of(&[most, 3.0, -0.5, 0.0]), of(&[-0.5 * most, 0.0, 0.0, 0.0])];
+        // Each element's gradient is in range, and a multiple of g is not.
+        let (value, grads) = gradients::<T>(|x, target| x.l1_loss(target), operands(), g);
+        assert_eq!(value, T::from_f64(0.375 * most));
+        let quarter = T::from_f64(g / 4.0);
+        grads.into_iter().for_each(|grad| assert_eq!(grad, [quarter, quarter, -quarter, T::ZERO]));
+        let (_, grads) = gradients::<T>(|x, target| x.smooth_l1_loss(target, 2.0), operands(), g);
+        grads.into_iter().for_each(|grad| assert_eq!(grad.as_slice()[..2], [quarter; 2]));
+        let (_, grads) = gradients::<T>(|x, target| x.huber_loss(target, 2.0), operands(), g / 4.0);
+        grads.into_iter().for_each(|grad| assert_eq!(grad.as_slice()[..2], [T::from_f64(g / 8.0); 2]));
+        let logits = || [of(&[most, -0.5 * most]).reshape(&[1, 2]), of(&[0.0])];
+        let (_, grads) = gradients::<T>(|x, _| x.cross_entropy_loss([1]), logits(), g);
+        grads.into_iter().for_each(|grad| assert_eq!(grad.as_slice(), [T::from_f64(g), T::from_f64(-g)]));
+        // The least residual has its sign.
+        let operands = || [of(&[most, least, 0.0, 0.0]), of(&[-0.5 * most, 0.0, 0.0, 0.0])];
+        let (_, grads) = gradients::<T>(|x, target| x.l1_loss(target), operands(), 1.0);
+        grads.into_iter().for_each(|grad| assert_eq!(grad.as_slice()[1], T::from_f64(0.25)));
+        // Small residuals keep their digits.
+        let mut residuals = vec![0.0; 1000];
+        residuals[..2].copy_from_slice(&[big, small]);
+        let (value, grads) = gradients::<T>(|x, target| x.mse_loss(target), [of(&residuals), of(&[0.0; 1000])], large);
+        let is_close = |got: T, exact: f64| (got.to_f64() / exact - 1.0).abs() <= 4.0 * T::EPSILON;
+        let [big, small, large] = [big, small, large].map(|x| T::from_f64(x).to_f64());
+        assert!(is_close(value, big / 1000.0 * big), "{value:?}");
+        let exact = small * (2.0 * large / 1000.0);
+        grads.into_iter().for_each(|grad| assert!(is_close(grad.as_slice()[1], exact), "{grad:?} for {exact:e}"));
+    }
+    check(f32::MAX, 1e38, 1e-45, [2e19, 1.3e-38, 1e10]);
+    check(f64::MAX, 1e308, 5e-324, [1e154, 3e-308, 1e10]);
+}
+
+/// The prediction and the target of a loss depend on one variable.
+#[test]
+fn gradients_of_mean_losses_of_targets_that_depend_on_predictions() {
+    let tape = Tape::<f32>::new();
+    let x = tape.leaf(Tensor::from([1e15_f32]));
+    let target = &x * 0.5;
+    let [y, equal] = [x.mse_loss(&target), x.mse_loss(&x)];
+    for g in [1e-43_f32, 1e-10] {
+        let g = tape.constant(Tensor::scalar(g));
+        let expected = 0.5 * 1e15 * f64::from(g.item());
+        for grad in [tape.no_grad(|| y.vjp(&g, &[&x])).remove(0), y.vjp(&g, &[&x]).remove(0)] {
+            assert!((f64::from(grad.value().as_slice()[0]) / expected - 1.0).abs() < 4e-7, "{grad:?} for {expected:e}");
+        }
+        assert_eq!(equal.vjp(&g, &[&x])[0].value(), [0.0]);
+    }
+}
+
 /// The gradient of each element of a loss is a subnormal number, or 0 after rounding, and its product is not.
 #[test]
 fn gradients_of_mean_losses_from_subnormal_shares() {
@@ -835,6 +901,7 @@ fn gradients_of_mean_losses_from_subnormal_shares() {
     check::<f64>(1e-322, 1e30);
 }
 
+/// Means of windows, and of gradients of windows that share a pixel, of numbers whose sum is out of range.
 #[test]
 fn pooled_means_at_the_end_of_the_range() {
     fn check<T: Scalar>(most: T) {
@@ -1021,6 +1088,123 @@ fn products_and_lengths_at_the_ends_of_the_range() {
     for n in [17_000, 18_200, 30_000] {
         assert!((y.value().as_slice()[n - 1] - exact(n as f64)).abs() <= 1e-9 * exact(n as f64) + power(-1074));
     }
+    // A NaN leaves products before it, and in other lines, as they are.
+    let x = tape.constant(Tensor::from([[1e300, 1e10, 1e-10, f64::NAN], [1e300, 1e100, 1e-50, 1e-50]]));
+    let y = x.cumprod(1);
+    for (i, expected) in [(0, 1e300), (2, 1e300), (4, 1e300), (7, 1e300)] {
+        assert!((y.value().as_slice()[i] / expected - 1.0).abs() < 4.0 * f64::EPSILON, "{y:?}");
+    }
+    assert!(y.value().as_slice()[3].is_nan());
     // Fewer elements than the correction.
     assert!(!tape.leaf(Tensor::from([1.0, 2.0])).var(3).item().is_finite());
+}
+
+/// Rounding errors of long products do not add up. The exact values are those of integers.
+#[test]
+fn long_products_are_rounded_once() {
+    let tape = Tape::<f64>::new();
+    let is_close = |got: f64, exact: f64, units: f64| {
+        assert!((got / exact - 1.0).abs() <= units * f64::EPSILON, "{got:e} for {exact:e}");
+    };
+    for (factor, n, exact) in [
+        (1.3, 50, 497929.22297912795),
+        (0.96, 300, 4.801422373777491e-6),
+        (0.96, 500, 1.366521659788137e-9),
+        (1.01, 2000, 439286205.05010384),
+    ] {
+        let x = tape.leaf(Tensor::full(&[n], factor));
+        let (y, cumulative) = (x.prod(), x.cumprod(0));
+        is_close(y.item(), exact, 0.5);
+        is_close(cumulative.value().as_slice()[n - 1], exact, 0.5);
+        let last = cumulative.slice_axis(0, n as isize - 1..).sum();
+        for grad in [y.grad(&[&x]).remove(0), last.grad(&[&x]).remove(0)] {
+            grad.iter().for_each(|got| is_close(got, exact / factor, 2.0));
+        }
+    }
+    for (factor, summand, n, exact) in [(0.96, 0.1, 300, 2.4999879964440637), (1.01, 0.3, 1000, 628744.6691344148)] {
+        let [a, b] = [factor, summand].map(|x| tape.leaf(Tensor::full(&[n], x)));
+        is_close(a.recurrence(&b, 0).value().as_slice()[n - 1], exact, 0.5);
+    }
+}
+
+/// Cross products whose two terms cancel or leave the range. The exact values are those of integers.
+#[test]
+fn cross_products_of_nearly_parallel_and_huge_vectors() {
+    fn cross<T: Scalar>(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+        let tape = Tape::<T>::new();
+        let [a, b] = [a, b].map(|x| tape.constant(Tensor::from(x.map(T::from_f64))));
+        let y = a.cross(&b);
+        std::array::from_fn(|i| y.value().as_slice()[i].to_f64())
+    }
+    fn check<T: Scalar>(digits: u32) {
+        let mut random = 1_u64;
+        let mut next = || {
+            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (random >> (65 - digits)) as i128 + (1 << (digits - 2))
+        };
+        for parallel in [false, true].repeat(200) {
+            let a = [next(), next(), next()];
+            let shift = |i: usize| if parallel { a[i] + (i as i128 % 2) } else { a[(i + 1) % 3] - 7 };
+            let b: [i128; 3] = std::array::from_fn(shift);
+            let exact = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+            let got = cross::<T>(a.map(|x| x as f64), b.map(|x| x as f64));
+            for (got, exact) in got.into_iter().zip(exact) {
+                assert!((got - exact as f64).abs() <= T::EPSILON * (exact as f64).abs(), "{got} for {exact}");
+            }
+        }
+    }
+    check::<f32>(24);
+    check::<f64>(53);
+    assert_eq!(cross::<f32>([1e20; 3], [1e20; 3]), [0.0; 3]);
+    assert_eq!(cross::<f64>([1e160; 3], [1e160; 3]), [0.0; 3]);
+    let power = |n: i32| 2.0_f64.powi(n);
+    assert_eq!(cross::<f32>([0.0, power(64), power(63)], [0.0, power(64), power(64)])[0], power(127));
+    assert_eq!(cross::<f64>([0.0, power(512), power(511)], [0.0, power(512), power(512)])[0], power(1023));
+    assert_eq!(cross::<f64>([0.0, power(-540), 3.0 * power(-540)], [0.0, power(-500), power(-500)])[0], -power(-1039));
+    assert_eq!(cross::<f64>([0.0, 1e300, 0.0], [0.0, 0.0, 1e300])[0], f64::INFINITY);
+    assert_eq!(cross::<f64>([0.0, 1e-300, 1.0], [0.0, 2.0, 1e-300])[0], -2.0);
+    // A value of 0 has a gradient in range.
+    let tape = Tape::<f32>::new();
+    let [a, b] = [0.0, 1e30].map(|x| tape.leaf(Tensor::full(&[3], x)));
+    let grads = a.cross(&b).vjp(&tape.constant(Tensor::full(&[3], 1e20)), &[&a, &b]);
+    grads.iter().for_each(|grad| assert_eq!(grad.value(), [0.0; 3]));
+}
+
+/// Partial sums leave the range, and the sum does not.
+#[test]
+fn sums_that_overflow_on_the_way() {
+    /// `power` is the largest power of two.
+    fn check<T: Scalar>(power: T) {
+        let of = |parts: &[f64]| {
+            let values: Vec<T> = parts.iter().map(|&x| T::from_f64(x) * power).collect();
+            Tensor::from_vec(&[values.len()], values)
+        };
+        let tape = Tape::<T>::new();
+        for (parts, expected) in [
+            (&[1.75, -1.75, 1.75][..], 1.75),
+            (&[1.75, 1.75, -1.75], 1.75),
+            (&[1.75, -1.75, 1.75, -1.75], 0.0),
+            (&[1.75, 1.75, -1.75, -1.75, 0.25], 0.25),
+            (&[1.75, 1.75], f64::INFINITY),
+            (&[-1.75, -1.75, 0.25], f64::NEG_INFINITY),
+        ] {
+            let (x, n) = (of(parts), parts.len());
+            let expected = T::from_f64(expected) * power;
+            assert_eq!(tape.constant(x.clone()).sum().item(), expected, "{parts:?}");
+            // Down the columns, beside a column with small numbers.
+            let small = Tensor::full(&[n], T::ONE);
+            let columns = Tensor::concat(&[&x.reshape(&[n, 1]), &small.reshape(&[n, 1])], 1);
+            let sums = tape.constant(columns.clone()).sum_over(0);
+            assert_eq!(sums.value(), [expected, T::from_f64(n as f64)]);
+            assert_eq!(tape.constant(columns.t()).sum_over(1).value(), sums.value());
+            // The adjoint of a broadcast.
+            let one = tape.leaf(Tensor::scalar(T::ONE));
+            let grad = one.broadcast_to(&[n]).vjp(&tape.constant(x), &[&one]).remove(0);
+            assert_eq!(grad.value().item(), expected);
+        }
+        let nan = of(&[f64::INFINITY, f64::NEG_INFINITY, 1.0]);
+        assert!(nan.sum().to_f64().is_nan() && of(&[f64::INFINITY, 1.0]).sum().to_f64() == f64::INFINITY);
+    }
+    check(2.0_f32.powi(127));
+    check(2.0_f64.powi(1023));
 }
