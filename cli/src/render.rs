@@ -222,6 +222,10 @@ pub fn run(args: &Args) -> Work<()> {
     let size = [cameras[0].width, cameras[0].height];
     let output = Output { kind, frames: cameras.len(), size, fps, keep_frames: args.keep_frames };
     let shard = args.shard.or_else(ranks::shard);
+    // Before the first file: the record of frames that are not finished.
+    if cameras.len() > 1 {
+        interrupt::listen_to_go_on();
+    }
     let mut frames = match shard {
         None => Frames::new(folder, of, &job, cameras.len(), &args.save)?,
         Some(shard) => {
@@ -230,9 +234,6 @@ pub fn run(args: &Args) -> Work<()> {
             Frames::of_shard(folder, shard, whole, &job, &args.save)?
         }
     };
-    if cameras.len() > 1 {
-        interrupt::listen_to_go_on();
-    }
     if args.ends_with_input {
         interrupt::listen_to_input();
     }

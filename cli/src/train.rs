@@ -449,9 +449,10 @@ fn train(
     share(&mut trainer, &run, budget, timeout)?;
     let sent = |trainer: &mut Trainer| trainer.exchange_mut().map(|exchange| exchange.sent_bytes());
     let before = (trainer.stats().step, sent(&mut trainer));
+    // Before the first file and the link of the viewer.
+    interrupt::listen();
     let mut window = listener.map(|listener| TrainingViewer::open(listener, &run, &trainer)).transpose()?;
     let mut watch = Watch::new((&run, lock), &trainer, budget, args.checkpoint_every, preview, args.tensorboard)?;
-    interrupt::listen();
     let (mut diverged, mut ended_by_page, mut interrupted) = (None, false, false);
     for retreats in 0.. {
         trainer.run(budget, |trainer| {
