@@ -172,12 +172,16 @@ impl Opened {
         Ok(capture.automatic_downscale(analysis, cells(analysis.scene_type)?))
     }
 
-    /// Loads at most `views` evenly spaced images of a split at `1 / downscale` of their size. Warns of absent images.
+    /// Loads at most `views` evenly spaced images of a split at `1 / downscale` of their size. Warns of images that are
+    /// left out.
     pub fn load(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
         let data = self.load_quietly(split, downscale, views)?;
-        if let Some(what) = missing(&data.skipped, data.frames.len()) {
-            complain(&format!("warning: {}: {what}", self.scene));
-        }
+        let rest = data.frames.len();
+        let left_out = [
+            left_out(&data.skipped, rest + data.masked.len(), "missing"),
+            left_out(&data.masked, rest, "masked as a whole"),
+        ];
+        left_out.iter().flatten().for_each(|what| complain(&format!("warning: {}: {what}", self.scene)));
         Ok(data)
     }
 
@@ -238,17 +242,17 @@ fn inside(capture: &Capture) -> Option<PathBuf> {
     Some(capture.file.strip_prefix(&capture.folder).ok()?.to_owned())
 }
 
-/// Describes skipped images, of which at most three are named. `present` other images exist.
-fn missing(skipped: &[String], present: usize) -> Option<String> {
+/// Says why images are left out, of which at most three are named. There are `others` besides.
+fn left_out(skipped: &[String], others: usize, why: &str) -> Option<String> {
     /// Names that are listed.
     const NAMED: usize = 3;
     let named = skipped.iter().take(NAMED).map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
-    match (skipped.len(), skipped.len() + present) {
+    match (skipped.len(), skipped.len() + others) {
         (0, _) => None,
-        (1, all) => Some(format!("1 of {all} images is missing and was skipped: {named}")),
+        (1, all) => Some(format!("1 of {all} images is {why} and was skipped: {named}")),
         (count, all) => {
             let rest = if count > NAMED { ", ..." } else { "" };
-            Some(format!("{count} of {all} images are missing and were skipped: {named}{rest}"))
+            Some(format!("{count} of {all} images are {why} and were skipped: {named}{rest}"))
         }
     }
 }

@@ -69,7 +69,17 @@ pub fn landscape_ahead(split: Split, width: usize) -> Dataset {
 }
 
 fn dataset(frames: Vec<Frame>, bounds: [DVec3; 2], [near, far]: [f64; 2], scene_type: SceneType) -> Dataset {
-    Dataset { frames, bounds, near, far, scene_type, ndc: None, transform: SceneTransform::default(), skipped: vec![] }
+    Dataset {
+        frames,
+        bounds,
+        near,
+        far,
+        scene_type,
+        ndc: None,
+        transform: SceneTransform::default(),
+        skipped: vec![],
+        masked: vec![],
+    }
 }
 
 /// Frames with the images of some cameras.

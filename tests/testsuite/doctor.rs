@@ -285,6 +285,27 @@ fn doctor_finds_single_wrong_poses() {
 }
 
 #[test]
+fn doctor_identifies_orders_of_poses() {
+    let mut as_text: Vec<usize> = (0..ALL).collect();
+    as_text.sort_by_key(|i| i.to_string());
+    // For each image, the index of the one whose pose it has. The order's own tests have the others.
+    let late: Vec<usize> = (0..ALL).map(|i| (i + ALL - 1) % ALL).collect();
+    for (order, text) in
+        [(late, "the poses are one image late"), (as_text, "the poses are in the order of the text of the names")]
+    {
+        let mut planted = Planted::new();
+        for (i, &from) in order.iter().enumerate() {
+            planted.camera(i).pose = PHOTOGRAPHS[from].1.pose;
+            planted.capture.views[i].name = format!("{i}.png");
+        }
+        let report = planted.report();
+        found(&report, Kind::PoseOrder, Error, &[], &[Kind::Leak, Kind::ExposureJump, Kind::WhiteBalanceJump]);
+        let finding = report.finds(Kind::PoseOrder).unwrap();
+        assert!(finding.what.starts_with(text), "{}", finding.what);
+    }
+}
+
+#[test]
 fn doctor_finds_one_image_under_two_names() {
     let planted = Planted::new();
     std::fs::copy(planted.path(8), planted.path(9)).unwrap();
@@ -320,8 +341,10 @@ fn doctor_finds_useless_masks_and_alpha() {
     planted.mask(3, 0.0);
     planted.mask(4, 1.0);
     let report = planted.report();
-    found(&report, Kind::MaskHidesAll, Error, &[3], &[]);
+    found(&report, Kind::MaskHidesAll, Warning, &[3], &[]);
     found(&report, Kind::MaskHidesNothing, Note, &[4], &[Kind::MaskHidesAll]);
+    (0..ALL).for_each(|view| planted.mask(view, 0.0));
+    found(&planted.report(), Kind::MaskHidesAll, Error, &(0..ALL).collect::<Vec<_>>(), &[]);
 
     let planted = Planted::new();
     planted.redraw(3, |image| image.over([1.0; 3]));

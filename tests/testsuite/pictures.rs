@@ -173,6 +173,7 @@ fn learned_scene_has_true_colour_depth_and_normals() {
         ndc: None,
         transform: SceneTransform::default(),
         skipped: vec![],
+        masked: vec![],
     };
     let mut config = Config::preset(Preset::Instant);
     let field = config.field.get_mut::<InstantConfig>().unwrap();

@@ -116,6 +116,8 @@ pub struct Dataset {
     pub transform: SceneTransform,
     /// Names of listed images whose files do not exist. They were left out; callers should report them.
     pub skipped: Vec<String>,
+    /// Names of images of which the [mask](Frame::mask) uses no pixel. They were left out; callers should report them.
+    pub masked: Vec<String>,
 }
 
 impl Dataset {

@@ -301,9 +301,10 @@ impl Capture {
     /// Reads the images of a split, in parallel, and maps their cameras to the scene by `analysis`.
     ///
     /// # Errors
-    /// If none of the split's images exists, an image or mask cannot be decoded or has another aspect ratio than its
-    /// camera, or `downscale` or `views` is 0. Which of several errors is reported does not depend on timing. Single
-    /// absent images are not an error: see [`Dataset::skipped`]. Before any image is decoded: if all of them together
+    /// If none of the split's images exists, or none has a pixel that is used. If an image or mask cannot be decoded or
+    /// has another aspect ratio than its camera, or `downscale` or `views` is 0. Which of several errors is reported does
+    /// not depend on timing. Single images that are absent or masked as a whole are not an error: see
+    /// [`Dataset::skipped`] and [`Dataset::masked`]. Before any image is decoded: if all of them together
     /// need more than [`LoadOptions::memory`], or an image has neither a mask nor transparency with
     /// [`LoadOptions::mask_as_alpha`].
     pub fn load(&self, split: Split, analysis: &SceneAnalysis, reading: &LoadOptions<'_>) -> Result<Dataset> {
@@ -331,8 +332,15 @@ impl Capture {
             (reading.progress)(done.fetch_add(1, Ordering::Relaxed) + 1, total);
             self.named(plans[i].view, frame)
         });
+        let frames = frames.into_iter().collect::<Result<Vec<_>>>()?;
+        let unused = plans.iter().zip(&frames).filter(|(_, frame)| frame.is_none());
+        let masked: Vec<String> = unused.map(|(plan, _)| plan.view.name.clone()).collect();
+        let frames: Vec<Frame> = frames.into_iter().flatten().collect();
+        if frames.is_empty() {
+            return self.named(plans[0].view, Err(plans[0].without_pixels()));
+        }
         Ok(Dataset {
-            frames: frames.into_iter().collect::<Result<_>>()?,
+            frames,
             bounds: analysis.bounds,
             near: analysis.near,
             ndc: analysis.ndc,
@@ -340,6 +348,7 @@ impl Capture {
             scene_type: analysis.scene_type,
             transform: analysis.transform,
             skipped: absent.into_iter().map(|view| view.name.clone()).collect(),
+            masked,
         })
     }
 
@@ -432,7 +441,8 @@ impl<'a> Plan<'a> {
         self.pixel.saturating_mul((self.to[0] * self.to[1]) as u64)
     }
 
-    fn frame(&self, transform: &SceneTransform, lit: &Lit, is_measured: bool) -> Result<Frame> {
+    /// Reads the image; `None` if no pixel is used.
+    fn frame(&self, transform: &SceneTransform, lit: &Lit, is_measured: bool) -> Result<Option<Frame>> {
         let Plan { view, path, size, to, is_cut, .. } = self;
         let photo = Photo::open(path, Some(*size))?;
         // Before downscaling, which weighs colours by alpha: the background does not bleed into the object.
@@ -447,14 +457,20 @@ impl<'a> Plan<'a> {
             (given, lit) => given.map(Arc::new).or(lit),
         };
         if mask.as_ref().is_some_and(|mask| mask.used() == 0) {
-            let mask = view.mask.as_ref().map_or("no mask".to_owned(), |mask| format!("the mask `{}`", mask.display()));
-            let what = format!("has no usable pixel, by {mask} and the lens: correct the mask, or remove the image");
-            return Err(Error::file(path, what));
+            return Ok(None);
         }
         let camera = transform.camera(&camera);
         let measured = view.depth.as_ref().filter(|_| is_measured);
         let distances = measured.map(|(path, unit)| distances(path, unit * transform.scale, &camera)).transpose()?;
-        Ok(Frame { name: view.name.clone(), camera, image, mask, distances })
+        Ok(Some(Frame { name: view.name.clone(), camera, image, mask, distances }))
+    }
+
+    /// The error of an image of which no pixel is used, and of which no other image exists.
+    fn without_pixels(&self) -> Error {
+        let mask = self.view.mask.as_ref();
+        let mask = mask.map_or("no mask".to_owned(), |mask| format!("the mask `{}`", mask.display()));
+        let what = format!("has no usable pixel, by {mask} and the lens, and no other image has: correct the mask");
+        Error::file(&self.path, what)
     }
 }
 

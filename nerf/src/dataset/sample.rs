@@ -34,6 +34,7 @@ pub(crate) fn ball(split: Split, size: usize) -> Dataset {
         ndc: None,
         transform: SceneTransform::default(),
         skipped: vec![],
+        masked: vec![],
     }
 }
 

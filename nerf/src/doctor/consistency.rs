@@ -1,12 +1,15 @@
-//! Findings from how well images match their neighbours: the convention of the poses, and single wrong poses.
+//! Findings from how well images match their neighbours: the convention and the order of the poses, and single wrong
+//! poses.
 
 use super::agreement::{Pair, Placed, Tally, compare};
 use super::kinds::FindingKind as Kind;
+use super::order::Order;
 use super::picture::Picture;
 use super::poses::Convention;
 use super::report::Findings;
 use crate::dataset::{View, evenly_spaced};
 use crate::numbers::median;
+use glam::DAffine3;
 use std::collections::BTreeMap;
 
 /// Images compared with their neighbours under each convention.
@@ -18,26 +21,44 @@ const FEWEST: usize = 8;
 const DEVIATIONS: f64 = 4.0;
 /// The agreement of good cameras.
 const GOOD: f64 = 0.2;
+/// Above this agreement, no other reading of the poses is tried.
+const CLEAR: f64 = 0.7;
 /// Below this agreement, images and cameras do not match. The report calls it poor.
 const NONE: f64 = 0.1;
 /// An image is wrong if its agreement is below this share of the median.
 const WRONG: f64 = 0.35;
 
+/// Another reading of the poses.
+#[derive(Clone, Copy)]
+enum Reading {
+    Convention(Convention),
+    Order(Order),
+}
+
 /// Adds findings about agreement between images; returns the agreement if enough patches match.
 pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Findings) -> Option<f64> {
-    let under = |convention: Convention| -> Vec<Placed<'_>> {
-        all.iter().map(|(view, picture)| Placed { picture, pose: convention.apply(view.camera.pose) }).collect()
+    let poses: Vec<DAffine3> = all.iter().map(|(view, _)| view.camera.pose).collect();
+    let placed = |pose: &dyn Fn(usize) -> DAffine3| -> Vec<Placed<'_>> {
+        all.iter().enumerate().map(|(i, (_, picture))| Placed { picture, pose: pose(i) }).collect()
     };
+    let as_read = placed(&|i| poses[i]);
     let tried = evenly_spaced((0..all.len()).collect(), TRIED);
-    let tally = |convention: Convention| total(&compare(&under(convention), &tried));
-    let read = tally(Convention::AsRead);
+    let read = total(&compare(&as_read, &tried));
     let own = if read.trials >= ENOUGH { read.skill() } else { 0.0 };
-    if own < 2.0 * GOOD {
-        let others = Convention::ALL[1..].iter().map(|convention| (*convention, tally(*convention)));
-        let enough = others.filter(|(_, tally)| tally.trials >= ENOUGH);
+    if own < CLEAR {
+        let names: Vec<&str> = all.iter().map(|(view, _)| &view.name[..]).collect();
+        let conventions = Convention::ALL[1..]
+            .iter()
+            .map(|&convention| (Reading::Convention(convention), placed(&|i| convention.apply(poses[i]))));
+        let orders = Order::ALL.iter().filter_map(|&order| {
+            let from = order.poses(&names)?;
+            Some((Reading::Order(order), placed(&|i| poses[from[i]])))
+        });
+        let tallies = conventions.chain(orders).map(|(reading, placed)| (reading, total(&compare(&placed, &tried))));
+        let enough = tallies.filter(|(_, tally)| tally.trials >= ENOUGH);
         let best = enough.max_by(|a, b| a.1.skill().total_cmp(&b.1.skill()));
-        if let Some((convention, tally)) = best.filter(|(_, tally)| tally.skill() > GOOD && tally.skill() > 2.0 * own) {
-            another(convention, [own, tally.skill()], findings);
+        if let Some((reading, tally)) = best.filter(|(_, tally)| is_better(tally.skill(), own)) {
+            another(reading, [own, tally.skill()], findings);
             return Some(own);
         }
     }
@@ -49,9 +70,14 @@ pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Fin
         return Some(own);
     }
     let of = evenly_spaced((0..all.len()).collect(), most);
-    let pairs = compare(&under(Convention::AsRead), &of);
+    let pairs = compare(&as_read, &of);
     findings.about(Kind::WrongPose, wrong_poses(&pairs).into_iter().map(|i| all[i].0), &[]);
     Some(total(&pairs).skill())
+}
+
+/// Returns true if images agree so much better under another reading that the one as read is wrong.
+fn is_better(other: f64, own: f64) -> bool {
+    other > GOOD && (other > 2.0 * own || 1.0 - other < 0.5 * (1.0 - own))
 }
 
 fn total(pairs: &[Pair]) -> Tally {
@@ -60,29 +86,36 @@ fn total(pairs: &[Pair]) -> Tally {
     total
 }
 
-/// Adds the finding that images match under another convention.
-fn another(convention: Convention, [own, other]: [f64; 2], findings: &mut Findings) {
+/// Adds the finding that images match under another reading.
+fn another(reading: Reading, [own, other]: [f64; 2], findings: &mut Findings) {
     // The images decide, so findings from poses alone are obsolete.
     findings.0.retain(|finding| {
         !matches!(finding.kind, Kind::LooksAway | Kind::OpenCvAxes | Kind::WorldToCamera | Kind::OnePlace)
     });
-    let finding = match convention {
-        Convention::AsRead => return,
-        Convention::OpenCv => findings.add(Kind::OpenCvAxes, &[]),
-        Convention::UpsideDown | Convention::Mitsuba => findings.add(Kind::TurnedCameras, &[]),
-        Convention::WorldToCamera | Convention::WorldToOpenCv => findings.add(Kind::WorldToCamera, &[]),
-        Convention::Mirrored | Convention::MirroredUpsideDown | Convention::MirroredBackwards => {
-            findings.add(Kind::Mirrored, &[])
-        }
+    let finding = match reading {
+        Reading::Order(order) => findings.add(Kind::PoseOrder, &[&order.text()]),
+        Reading::Convention(convention) => match convention {
+            Convention::AsRead => return,
+            Convention::OpenCv => findings.add(Kind::OpenCvAxes, &[]),
+            Convention::UpsideDown | Convention::Mitsuba => findings.add(Kind::TurnedCameras, &[]),
+            Convention::WorldToCamera | Convention::WorldToOpenCv => findings.add(Kind::WorldToCamera, &[]),
+            Convention::Mirrored | Convention::MirroredUpsideDown | Convention::MirroredBackwards => {
+                findings.add(Kind::Mirrored, &[])
+            }
+        },
     };
     finding.what += &format!(" (agreement {other:.2} if changed, {own:.2} as read)");
-    finding.advice += match convention {
-        Convention::WorldToOpenCv => " Then negate the second and third columns: the camera axes are OpenCV's.",
-        Convention::UpsideDown => {
+    finding.advice += match reading {
+        Reading::Convention(Convention::WorldToOpenCv) => {
+            " Then negate the second and third columns: the camera axes are OpenCV's."
+        }
+        Reading::Convention(Convention::UpsideDown) => {
             " These are the first and the second one. Or turn the images, if their EXIF orientation counts in the poses \
              alone."
         }
-        Convention::Mitsuba => " These are the first and the third one: the camera axes are Mitsuba's.",
+        Reading::Convention(Convention::Mitsuba) => {
+            " These are the first and the third one: the camera axes are Mitsuba's."
+        }
         _ => "",
     };
 }

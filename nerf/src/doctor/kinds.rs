@@ -120,6 +120,10 @@ kinds! {
         "the cameras mirror the world: one axis has the wrong sign",
         "The poses use left-handed axes. Negate one row of each matrix, and one column of each rotation so that it \
          stays a rotation.";
+    /// Images and poses were listed in different orders.
+    PoseOrder = "pose-order", Error,
+        "the poses are {}",
+        "Give each image its own pose: list images and poses in one order, without gaps.";
     /// Images match their cameras under no convention.
     NoAgreement = "no-agreement", Warning,
         "the images match their cameras hardly better than chance, under any convention",
@@ -193,10 +197,10 @@ kinds! {
         "the aspect ratio of the mask does not match that of {}: {}",
         "A mask may have any size, but it must show the whole image. Make these masks again.";
     /// Masks hide whole images.
-    MaskHidesAll = "mask-hides-all", Error,
+    MaskHidesAll = "mask-hides-all", Warning,
         "the masks of {} hide every pixel",
-        "Masks are white where pixels are used. Invert them if they are the wrong way round; otherwise remove these \
-         images.";
+        "Training skips these images. Masks are white where pixels are used: invert them if they are the wrong way \
+         round.";
     /// Masks hide nothing.
     MaskHidesNothing = "mask-hides-nothing", Note,
         "the masks of {} hide no pixel",

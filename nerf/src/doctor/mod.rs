@@ -9,6 +9,7 @@ mod kinds;
 mod layout;
 mod look;
 mod nearby;
+mod order;
 mod picture;
 mod pixels;
 mod poses;

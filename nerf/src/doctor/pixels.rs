@@ -174,7 +174,11 @@ fn light(seen: &[Seen<'_>], findings: &mut Findings) {
 
 fn masks(seen: &[Seen<'_>], findings: &mut Findings) {
     let with = |share: f64| seen.iter().filter(move |one| one.look.used == Some(share)).map(|one| one.view);
-    findings.about(Kind::MaskHidesAll, with(0.0), &[]);
+    if let Some(finding) = findings.about(Kind::MaskHidesAll, with(0.0), &[])
+        && finding.views.len() == seen.len()
+    {
+        finding.severity = Severity::Error;
+    }
     findings.about(Kind::MaskHidesNothing, with(1.0), &[]);
 }
 

@@ -704,10 +704,17 @@ fn masks_without_white_are_refused_by_name() {
             assert_eq!(message.contains("mask.png: has no white"), is_refused, "{message}");
         }
     }
-    // A mask that uses nothing is named beside its image.
+    // Without a used pixel in any image, the mask is named beside its image.
     Image { width: 12, height: 8, channels: 1, data: vec![0.0; 96] }.save_png(&path).unwrap();
     let message = load(false).unwrap_err().to_string();
     assert!(message.contains("has no usable pixel, by the mask `") && message.contains("mask.png`"), "{message}");
+    // Otherwise the image is left out.
+    let shown = capture.views.iter_mut().find(|view| view.image.is_some() && view.split == Some(Split::Train)).unwrap();
+    let name = shown.name.clone();
+    shown.mask = None;
+    let data = capture.load(Split::Train, &analysis, &LoadOptions::default()).unwrap();
+    assert_eq!(data.frames.iter().map(|frame| &frame.name).collect::<Vec<_>>(), [&name]);
+    assert!(!data.masked.is_empty() && !data.masked.contains(&name), "{:?}", data.masked);
 }
 
 #[test]
