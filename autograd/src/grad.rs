@@ -153,7 +153,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         let sums = self.sums(seed, wrt, Keep::GraphAndGradients)?;
         let gradient = |(sum, x): (_, &&Var<'t, T>)| {
             let gradient = dense(sum, x.shape(), self.tape);
-            if self.tape.is_recording() { gradient.tracked() } else { gradient }
+            if self.tape.is_recording() { gradient.tracked() } else { gradient.detach() }
         };
         Ok(sums.into_iter().zip(wrt).map(gradient).collect())
     }

@@ -57,7 +57,9 @@ impl<T: Scalar> Op<T> for Extremum {
         let (x, y, g) = (cx.x(0), cx.y(), cx.g());
         if cx.recording() {
             let equal = x.elementwise_eq(&y);
-            let share = g / cx.constant(equal.cast()).sum_to(y.shape());
+            // No element equals NaN.
+            let count = cx.constant(equal.cast()).sum_to(y.shape()).maximum(1.0);
+            let share = g / count;
             return Grads::one(share.where_(&equal, 0.0));
         }
         let mut out = cx.pool().tensor(x.shape());

@@ -106,6 +106,8 @@ fn nested<T: Scalar, U: Scalar>(
     reference: impl for<'n> FnOnce(&[Var<'n, U>]) -> Option<Var<'n, U>>,
 ) -> Vec<Option<Tensor<T>>> {
     let tape = cx.tape().nested();
+    // Values on the way may overflow. The results are checked as those of any gradient.
+    tape.check_finite(false);
     let x: Vec<_> = (0..cx.len()).map(|i| tape.leaf(cast(cx.x(i).value()))).collect();
     let wanted: Vec<_> = (0..cx.len()).filter(|&i| cx.needs(i)).map(|i| &x[i]).collect();
     let Some(y) = reference(&x) else { unreachable!("a fused operation has a reference") };

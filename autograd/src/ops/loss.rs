@@ -362,12 +362,12 @@ impl<T: Scalar> Op<T> for MeanCrossEntropy {
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let (mean, [losses, logits]) = (mean_to(x[0], &[], pool), [x[0], x[1]]);
-        if mean.is_finite() || !logits.is_finite() {
+        if mean.is_finite() || losses.is_empty() || !logits.is_finite() {
             return mean;
         }
         let [down, up] = [0.25, 4.0].map(T::from_f64);
         let mut small = losses.clone();
-        let rows = logits.as_slice().chunks_exact(logits.len() / losses.len().max(1));
+        let rows = logits.as_slice().chunks_exact(logits.len() / losses.len());
         for ((loss, row), &class) in small.as_mut_slice().iter_mut().zip(rows).zip(self.classes.iter()) {
             // Beside a difference that overflows, the logarithm of the sum is that of its largest term.
             let most = || row.iter().copied().reduce(Real::maximum).unwrap_or(T::ZERO);

@@ -176,7 +176,7 @@ fn split(x: f64) -> (f64, i64) {
 /// A number `factor * 2^exponent` of any size. The exponent stays 0 as long as numbers are in the middle of f64's range.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Unbounded {
-    /// Between 2^-400 and 2^400, unless it is 0 or not finite.
+    /// Between 2^-400 and 2^400, unless it is 0 or not finite. After terms cancel it may be smaller.
     factor: Double,
     exponent: i64,
 }
@@ -207,7 +207,9 @@ impl Unbounded {
     /// The factor in 1..2, up to its sign, and the exponent that belongs to it.
     fn split(self) -> (Double, i64) {
         let (_, up) = split(self.factor.value());
-        (self.factor.scaled(power_of_two(-up)), self.exponent + up)
+        // In two steps: after terms have cancelled, the factor may be as small as a subnormal number.
+        let factor = halves(-up).into_iter().fold(self.factor, |factor, half| factor.scaled(power_of_two(half)));
+        (factor, self.exponent + up)
     }
 
     /// The product of two numbers.

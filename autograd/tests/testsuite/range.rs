@@ -1127,6 +1127,77 @@ fn long_products_are_rounded_once() {
     }
 }
 
+/// Terms cancel in numbers whose exponent is their own, and leave the rounding error of another.
+#[test]
+fn terms_that_cancel_leave_finite_numbers() {
+    let tape = Tape::<f64>::new();
+    let of = |values: &[f64]| tape.leaf(Tensor::from_vec(&[values.len()], values.to_vec()));
+    let y = of(&[1.0; 6]).recurrence(&of(&[1e41, 1e-276, -1e41, 0.0, 3.0, 4.0]), 0);
+    assert!(y.value().is_finite(), "{y:?}");
+    assert_eq!(y.value().as_slice()[4..], [3.0, 7.0]);
+    let y = of(&[1.0, 1.0, 1.0, 1e10]).recurrence(&of(&[1.0, 1e-310, -1.0, 0.0]), 0);
+    assert!((y.value().as_slice()[3] / 1e-300 - 1.0).abs() < 1e-12, "{y:?}");
+    for (g, expected) in [
+        (&[3.0, -1e41, 1e-276, 1e41][..], &[3.0, 1e-276, 1e41, 1e41][..]),
+        (&[3.0, 1.0, -1.0, 1e-310, 1.0], &[4.0, 1.0, 0.0, 1.0, 1.0]),
+    ] {
+        let x = of(&vec![1.0; g.len()]);
+        let grad = x.cumprod(0).vjp(&of(g), &[&x]).remove(0);
+        // In units of the largest term.
+        let unit = g.iter().fold(0.0_f64, |most, g| most.max(g.abs())) * f64::EPSILON;
+        let is_close = |(got, expected): (f64, &f64)| (got - expected).abs() <= unit;
+        assert!(grad.value().iter().zip(expected).all(is_close), "{grad:?} for {expected:?}");
+    }
+}
+
+#[test]
+fn losses_of_no_rows_are_nan() {
+    let tape = Tape::<f32>::new();
+    for shape in [&[0, 3][..], &[2, 0, 3], &[0, 0]] {
+        let x = tape.leaf(Tensor::zeros(shape));
+        let y = x.cross_entropy_loss([]);
+        assert!(y.item().is_nan());
+        assert_eq!(y.grad(&[&x])[0].shape(), shape);
+    }
+    let none = tape.constant(Tensor::zeros(&[0]));
+    assert!(none.mse_loss(&none).item().is_nan() && none.huber_loss(&none, 1.0).item().is_nan());
+}
+
+/// A row without a largest element has no part in second derivatives.
+#[test]
+fn extrema_of_nan_do_not_spoil_second_derivatives() {
+    let tape = Tape::<f64>::new();
+    let x = tape.leaf(Tensor::from([[f64::NAN, 1.0], [2.0, 3.0]]));
+    let w = tape.leaf(Tensor::scalar(1.0));
+    for y in [x.max_over(1), x.min_over(1)] {
+        let first = (y * &w).sum().grad_graph(&[&x]).remove(0);
+        assert_eq!(first.sum().grad(&[&w])[0].item(), 1.0);
+    }
+}
+
+/// Numbers on the way to a gradient overflow, and the gradient does not.
+#[test]
+fn searches_for_infinity_leave_out_values_on_the_way() {
+    let power = |n: i32| 2.0_f32.powi(n);
+    let tape = Tape::<f32>::new();
+    tape.check_finite(true);
+    let x = tape.leaf(Tensor::from([power(60), power(60), power(-100)]));
+    let first = x.prod().grad_graph(&[&x]).remove(0);
+    let seed = tape.constant(Tensor::from([0.0, 0.0, power(20)]));
+    let second = tape.no_grad(|| first.try_vjp(&seed, &[&x])).unwrap().remove(0);
+    assert_eq!(second.value(), [power(80), power(80), 0.0]);
+}
+
+#[test]
+fn gradients_in_no_grad_are_constants() {
+    let tape = Tape::<f64>::new();
+    let x = tape.leaf(Tensor::scalar(2.0));
+    let (y, seed) = (&x * 3.0, tape.leaf(Tensor::scalar(1.0)));
+    let grads = tape.no_grad(|| y.vjp(&seed, &[&y, &x]));
+    assert!(grads.iter().all(|grad| !grad.is_on_graph()), "{grads:?}");
+    assert!(y.vjp(&seed, &[&y, &x]).iter().all(|grad| grad.is_on_graph()));
+}
+
 /// Cross products whose two terms cancel or leave the range. The exact values are those of integers.
 #[test]
 fn cross_products_of_nearly_parallel_and_huge_vectors() {
