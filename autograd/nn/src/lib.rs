@@ -32,12 +32,15 @@
 //! * [`Optimizer`]: [`Sgd`], [`Adam`], [`AdamW`]. Around it: [`Schedule`], [`clip_norm`], [`Ema`].
 //! * [`Tiles`]: a training step in parallel, with the same bits for any number of threads. With an [`Exchange`]:
 //!   on several machines.
-//! * [`OptimizerState`] and [`Params`] as files, with the feature `files`: safetensors, and NumPy's npz.
+//! * [`OptimizerState`] and [`Params`] as files, with the feature `files`: safetensors, and NumPy's npz. [`npy`]: one
+//!   array.
 
 mod exchange;
 #[cfg(feature = "files")]
 mod files;
 mod layers;
+#[cfg(feature = "files")]
+pub mod npy;
 #[cfg(feature = "files")]
 mod npz;
 mod optim;

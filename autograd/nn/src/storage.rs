@@ -28,8 +28,8 @@ impl Storage {
     fn round<T: Scalar>(self, x: T) -> T {
         match self {
             Storage::Full => x,
-            Storage::F16 => T::from_f64(f16::from_f64(x.to_f64()).to_f64()),
-            Storage::Bf16 => T::from_f64(bf16::from_f64(x.to_f64()).to_f64()),
+            Storage::F16 => T::from_f64(f16::from_f32(to_odd(x.to_f64())).to_f64()),
+            Storage::Bf16 => T::from_f64(bf16::from_f32(to_odd(x.to_f64())).to_f64()),
         }
     }
 
@@ -58,8 +58,8 @@ impl Storage {
         let pairs = |pair: fn(f64) -> [u8; 2]| values.iter().flat_map(move |x| pair(x.to_f64()));
         match self {
             Storage::Full => T::write_le(values, &mut out),
-            Storage::F16 => out.extend(pairs(|x| f16::from_f64(x).to_le_bytes())),
-            Storage::Bf16 => out.extend(pairs(|x| bf16::from_f64(x).to_le_bytes())),
+            Storage::F16 => out.extend(pairs(|x| f16::from_f32(to_odd(x)).to_le_bytes())),
+            Storage::Bf16 => out.extend(pairs(|x| bf16::from_f32(to_odd(x)).to_le_bytes())),
         }
         out
     }
@@ -72,6 +72,17 @@ impl Storage {
             Storage::Bf16 => pairs().map(|&pair| T::from_f64(bf16::from_le_bytes(pair).to_f64())).collect(),
         }
     }
+}
+
+/// The number as f32, or the neighbour whose last bit is 1 if it lies between two. So rounding that to 16 bits is the
+/// same as rounding once. `half` does not round f64 to nearest: it cuts digits off first.
+fn to_odd(x: f64) -> f32 {
+    let near = x as f32;
+    if f64::from(near) == x || !near.is_finite() {
+        return near;
+    }
+    let toward_zero = near.to_bits() - u32::from(f64::from(near).abs() > x.abs());
+    f32::from_bits(toward_zero | 1)
 }
 
 /// The reason that stored parameters do not fit a model.
@@ -368,5 +379,29 @@ mod tests {
         let message = params.load_safetensors(&written(&odd)).unwrap_err().to_string();
         assert!(message.starts_with("`c\\nd` is not a parameter"), "{message}");
         assert!(params.load_safetensors(b"no tensors").is_err());
+    }
+
+    #[test]
+    fn numbers_are_rounded_to_the_nearest() {
+        // Half a step above 1, and the numbers beside it.
+        let bf16 = |x: f64| Storage::Bf16.round::<f64>(x);
+        let f16 = |x: f64| Storage::F16.round::<f64>(x);
+        let (half, half16) = (2.0_f64.powi(-8), 2.0_f64.powi(-11));
+        for tiny in [2.0_f64.powi(-23), 2.0_f64.powi(-40), 2.0_f64.powi(-52)] {
+            for sign in [1.0, -1.0] {
+                assert_eq!(
+                    [1.0 + half - tiny, 1.0 + half + tiny].map(|x| bf16(sign * x)),
+                    [sign, sign * (1.0 + 2.0 * half)]
+                );
+                assert_eq!(
+                    [1.0 + half16 - tiny, 1.0 + half16 + tiny].map(|x| f16(sign * x)),
+                    [sign, sign * (1.0 + 2.0 * half16)]
+                );
+            }
+        }
+        assert_eq!(([bf16(1.0 + half), f16(1.0 + half16)], bf16(1.0 + 3.0 * half)), ([1.0; 2], 1.0 + 4.0 * half));
+        assert_eq!(Storage::Bf16.round(f32::from_bits(0x3f80_8001)), f32::from_bits(0x3f81_0000));
+        assert!(bf16(f64::NAN).is_nan() && f16(1e300) == f64::INFINITY && bf16(-1e-300).is_sign_negative());
+        assert_eq!([bf16(1e-300), f16(2.0_f64.powi(-25) * 1.0001)], [0.0, 2.0_f64.powi(-24)]);
     }
 }

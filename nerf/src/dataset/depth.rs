@@ -1,12 +1,13 @@
 //! Depth images: reading measured depths, and writing rendered ones.
 
-use super::formats::npy;
+use super::formats::npy::Matrix;
 use super::image::Image;
 use super::photo::unsupported::EXR;
 use super::photo::{Header, decoder_of};
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma};
+use raygrad_nn::npy;
 use std::fs::File;
 use std::io::{Cursor, Read};
 use std::path::Path;
@@ -48,7 +49,7 @@ fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
     let wrong = |what: String| Error::file(path, what);
     let bytes = std::fs::read(path).map_err(|error| Error::file(path, error))?;
     if bytes.starts_with(npy::MAGIC) {
-        let npy::Matrix { rows, columns, values } = npy::Matrix::read(&bytes).map_err(wrong)?;
+        let Matrix { rows, columns, values } = Matrix::read(&bytes).map_err(wrong)?;
         return Ok(([columns, rows], values));
     }
     if bytes.starts_with(EXR) {
@@ -182,7 +183,7 @@ impl Depths {
     /// Encodes a `.npy` file of an f32 array `[height, width]`.
     pub fn to_npy(&self) -> Vec<u8> {
         let [width, height] = self.size;
-        npy::write_single([height, width], &self.values)
+        npy::encode(&[height, width], &self.values)
     }
 }
 
@@ -266,7 +267,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("depth.npy");
         let values = vec![1.0, f64::NAN, -1.0, f64::INFINITY, 2.5, 1e300];
-        std::fs::write(&path, npy::Matrix { rows: 2, columns: 3, values }.write()).unwrap();
+        std::fs::write(&path, Matrix { rows: 2, columns: 3, values }.write()).unwrap();
         let camera = Camera::from_angle(3, 2, 0.1, DAffine3::IDENTITY);
         let found = distances(&path, 2.0, &camera).unwrap();
         assert!((found.data[0] - 2.0).abs() < 0.01 && (found.data[4] - 5.0).abs() < 0.02, "{found:?}");

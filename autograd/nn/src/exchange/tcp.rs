@@ -7,6 +7,10 @@ use std::sync::mpsc::{Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+/// Limits of timeouts: connections refuse 0, and clocks end.
+const SHORTEST: Duration = Duration::from_millis(1);
+const LONGEST: Duration = Duration::from_secs(1 << 30);
+
 /// Time between attempts to connect.
 const RETRY: Duration = Duration::from_millis(20);
 
@@ -65,7 +69,7 @@ impl Tcp {
         addresses: &[impl ToSocketAddrs],
         timeout: Duration,
     ) -> Result<Self, ExchangeError> {
-        let until = Instant::now() + timeout;
+        let until = Instant::now() + timeout.min(LONGEST);
         let absent = |other: usize, error: io::Error| {
             let what = format!("rank {rank} cannot reach rank {other} within {} s: {error}", timeout.as_secs());
             ExchangeError::Connection(what)
@@ -150,6 +154,7 @@ impl Peer {
     }
 
     fn set_timeout(&self, timeout: Duration) -> io::Result<()> {
+        let timeout = timeout.clamp(SHORTEST, LONGEST);
         self.incoming.set_read_timeout(Some(timeout))?;
         self.incoming.set_write_timeout(Some(timeout))
     }
@@ -244,6 +249,22 @@ mod tests {
                 assert!(tcp.all_to_all(&parts).unwrap() == expected, "round {round}");
             }
             assert_eq!(tcp.sent_bytes(), 2 * 3_000_000 * 3);
+        });
+    }
+
+    #[test]
+    fn timeouts_of_any_length_are_kept() {
+        on_ranks(2, Duration::MAX, |mut tcp| {
+            tcp.all_gather(&[1]).unwrap();
+            if tcp.rank() == 0 {
+                tcp.set_timeout(Duration::ZERO);
+                let start = Instant::now();
+                tcp.all_gather(&[2]).unwrap_err();
+                assert!(start.elapsed() < Duration::from_secs(2), "{:?}", start.elapsed());
+            } else {
+                // Rank 0 gives up before this connection ends.
+                std::thread::sleep(Duration::from_secs(3));
+            }
         });
     }
 

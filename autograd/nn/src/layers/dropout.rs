@@ -25,8 +25,8 @@ impl Dropout {
         Dropout { rate }
     }
 
-    /// Applies dropout to `x`. In training, each element becomes 0 or is divided by `1 - rate`. The choice depends on
-    /// the seed and the position alone. Two layers of a model need different seeds ([`Mode::part`]), which
+    /// Applies dropout to `x`. In training, each element is multiplied by 0 or divided by `1 - rate`. The choice depends
+    /// on the seed and the position alone. Two layers of a model need different seeds ([`Mode::part`]), which
     /// [`Sequential`](super::Sequential) provides.
     ///
     /// ```
