@@ -163,9 +163,21 @@ fn prepare(args: &Args) -> Work<()> {
     if !input.exists() {
         return Err(Error::file(input, "there is no such file or folder").into());
     }
-    if !input.is_file() && Capture::read(input).is_ok() {
-        let what = "already has camera poses: train on it, or choose a format to convert it to with --to";
-        return Err(Error::file(input, what).into());
+    if !input.is_file() {
+        match Capture::read(input) {
+            Ok(_) => {
+                let what = "already has camera poses: train on it, or choose a format to convert it to with --to";
+                return Err(Error::file(input, what).into());
+            }
+            Err(error) if Capture::is_described(input) => {
+                // Without images, it is for another program, which the error names.
+                if !photographs::are_in(input) {
+                    return Err(error.into());
+                }
+                complain(&format!("note: {}: its camera poses are not used: {error}", input.display()));
+            }
+            Err(_) => {}
+        }
     }
     let Args { frames, lens, allow_outside, ref out, .. } = *args;
     make(&Input { path: input, frames, lens, allow_outside }, out)?;

@@ -77,36 +77,60 @@ pub fn check_no_image(file: &Path) -> Result<()> {
     }
 }
 
+/// Folders of images in a folder. Programs for 3D Gaussians use `input`.
+const FOLDERS: [&str; 4] = ["images", "image", "rgb", "input"];
+
+/// The folders in which [`find`] looks for images.
+fn places(folder: &Path) -> impl Iterator<Item = PathBuf> {
+    std::iter::once(folder.to_owned()).chain(FOLDERS.map(|name| folder.join(name)))
+}
+
 /// Returns true if [`find`] finds images in a folder, or some that raygrad cannot read.
 pub fn are_in(folder: &Path) -> bool {
-    let files = [folder, &folder.join("images")].map(std::fs::read_dir).into_iter().flatten().flatten().flatten();
+    let files = places(folder).filter_map(|place| std::fs::read_dir(place).ok()).flatten().flatten();
     files
         .map(|entry| entry.path())
         .any(|path| [&READ[..], &CONVERTED, &NOT_READ].iter().any(|endings| ends(&path, endings)))
 }
 
-/// The images in a folder, sorted by name. Warns of images that raygrad cannot read.
+/// The images in a folder, sorted by name, and the number of those that raygrad cannot read.
+fn images(folder: &Path) -> (Vec<PathBuf>, usize) {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    // Hidden files, such as the `._` twins of macOS, are no images.
+    let shown = entries.filter(|entry| !entry.file_name().as_encoded_bytes().starts_with(b"."));
+    let files: Vec<PathBuf> = shown.map(|entry| entry.path()).filter(|path| path.is_file()).collect();
+    let unread = files.iter().filter(|path| ends(path, &NOT_READ)).count();
+    let mut found: Vec<PathBuf> =
+        files.into_iter().filter(|path| ends(path, &READ) || ends(path, &CONVERTED)).collect();
+    found.sort();
+    (found, unread)
+}
+
+/// The images of a folder or of a folder of images in it: the first of those that have most. Warns of images that raygrad
+/// cannot read, and names the other folders.
 pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
-    let inner = folder.join("images");
-    for folder in [folder, &inner] {
-        let Ok(entries) = std::fs::read_dir(folder) else { continue };
-        // Hidden files, such as the `._` twins of macOS, are no images.
-        let shown = entries.flatten().filter(|entry| !entry.file_name().as_encoded_bytes().starts_with(b"."));
-        let files: Vec<PathBuf> = shown.map(|entry| entry.path()).filter(|path| path.is_file()).collect();
-        let others = files.iter().filter(|path| ends(path, &NOT_READ)).count();
-        let mut found: Vec<PathBuf> =
-            files.into_iter().filter(|path| ends(path, &READ) || ends(path, &CONVERTED)).collect();
-        if others > 0 {
-            let what = "images are TIFF, EXR or raw, which raygrad cannot read: convert them to JPEG or PNG";
-            if found.is_empty() {
-                return Err(Error::file(folder, format!("{others} {what}")));
-            }
-            complain(&format!("warning: {}: {others} {what}", folder.display()));
+    let unreadable = |count: usize| {
+        format!("{count} images are TIFF, EXR or raw, which raygrad cannot read: convert them to JPEG or PNG")
+    };
+    let all: Vec<_> = places(folder).map(|place| (images(&place), place)).collect();
+    let best = all.iter().rev().max_by_key(|((found, _), _)| found.len());
+    let Some(((found, unread), place)) = best.filter(|((found, _), _)| !found.is_empty()) else {
+        if let Some(((_, unread), place)) = all.iter().find(|((_, unread), _)| *unread > 0) {
+            return Err(Error::file(place, unreadable(*unread)));
         }
-        if !found.is_empty() {
-            found.sort();
-            return Ok(found);
-        }
+        let what = "holds no images: put .jpg, .png, .webp or .heic files in it or in its folder `images`";
+        return Err(Error::file(folder, what));
+    };
+    if *unread > 0 {
+        complain(&format!("warning: {}: {}", place.display(), unreadable(*unread)));
     }
-    Err(Error::file(folder, "holds no images: put .jpg, .png, .webp or .heic files in it or in its folder `images`"))
+    for ((others, _), other) in all.iter().filter(|((others, _), other)| !others.is_empty() && other != place) {
+        let (used, left) = (found.len(), others.len());
+        complain(&format!(
+            "note: used the {used} images of {}, not the {left} of {}",
+            place.display(),
+            other.display()
+        ));
+    }
+    Ok(found.clone())
 }

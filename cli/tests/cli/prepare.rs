@@ -95,6 +95,30 @@ pub fn place() -> Place {
     place
 }
 
+#[test]
+fn prepare_takes_the_folder_with_most_images_and_names_unread_poses() {
+    let place = place();
+    std::fs::create_dir(place.path("scene")).unwrap();
+    std::fs::rename(place.path("photos"), place.path("scene/input")).unwrap();
+    std::fs::write(place.path("scene/cover.jpg"), jpeg(4, 1)).unwrap();
+    std::fs::write(place.path("scene/transforms.json"), "{\"frames\": [],}").unwrap();
+    let output = command(&place, "prepare scene --out made").output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    for part in [
+        "note: scene: its camera poses are not used: ",
+        "transforms.json: ",
+        "note: used the 5 images of scene/input, not the 1 of scene",
+    ] {
+        assert!(said.contains(part), "{part} in {said}");
+    }
+    assert!(place.path("made/images/4.JPG").exists() && !place.path("made/images/cover.jpg").exists());
+    // Of equally many, the folder itself counts; without images, poses that cannot be read are the error.
+    std::fs::create_dir_all(place.path("lost/images")).unwrap();
+    std::fs::write(place.path("lost/transforms.json"), "{").unwrap();
+    place.fails("prepare lost --out other", &["transforms.json: "]);
+}
+
 /// A JPEG of 16 x 8 pixels with stripes and an EXIF orientation.
 fn jpeg(period: usize, orientation: u8) -> Vec<u8> {
     let mut exif = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
