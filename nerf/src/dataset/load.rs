@@ -203,8 +203,11 @@ impl Capture {
         }
         if found.is_empty() {
             let first = self.views.first().filter(|_| self.present().next().is_none());
-            let why =
-                first.map_or(String::new(), |view| format!(": none of its images exists, such as `{}`", view.name));
+            let why = match (first, split) {
+                (Some(view), _) => format!(": none of its images exists, such as `{}`", view.name),
+                (None, Split::Train) => String::new(),
+                (None, _) => format!("; {CHOOSE}"),
+            };
             return Err(Error::file(&self.file, format!("has no {split} images{why}")));
         }
         Ok(found)

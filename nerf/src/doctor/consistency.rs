@@ -147,3 +147,25 @@ fn is_wrong(tally: Tally, usual: f64) -> bool {
     let deviation = (count * rate * (1.0 - rate)).sqrt();
     tally.skill() < WRONG * usual && (tally.wins as f64) < count * rate - DEVIATIONS * deviation
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn other_readings_must_agree_far_better() {
+        // Twice the agreement, or half of the disagreement.
+        for (other, own, expected) in [
+            (0.45, 0.2, true),
+            (0.35, 0.2, false),
+            (0.8, 0.54, true),
+            (0.7, 0.54, false),
+            (0.9, 0.69, true),
+            (0.19, 0.0, false),
+            (0.21, 0.0, true),
+            (f64::NAN, 0.0, false),
+        ] {
+            assert_eq!(is_better(other, own), expected, "{other} for {own}");
+        }
+    }
+}

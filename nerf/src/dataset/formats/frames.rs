@@ -42,6 +42,10 @@ pub(super) struct Frames {
     pub(super) left_out: HashSet<String>,
     /// The name and error of the first of them.
     error: Option<(String, Error)>,
+    /// The scale of all rotations, if they have one.
+    scale: Option<f64>,
+    /// Names of frames that are marked as bad.
+    bad: Vec<String>,
     /// Sentences about files found elsewhere, and frames left out.
     pub(super) assumptions: Vec<String>,
 }
@@ -58,6 +62,12 @@ impl Frames {
         let all: Vec<&Object<'_>> = frames.iter().flatten().collect();
         for frame in &all {
             frame.required("file_path")?;
+        }
+        out.scale = matrix::shared_scale(&all, "transform_matrix");
+        if let Some(scale) = out.scale {
+            let what =
+                format!("all rotations scale by {scale:.6}: divided them by it, and left the positions as they are");
+            out.assumptions.push(what);
         }
         // A mask or depth that stands beside the images is no image.
         let mut taken = HashSet::new();
@@ -76,12 +86,17 @@ impl Frames {
         }
         if let Some((name, error)) = out.error.take() {
             // Images that are mostly left out make a bad scene.
-            if 2 * out.left_out.len() >= all.len() {
+            let count = out.left_out.len().saturating_sub(out.bad.len());
+            if 2 * count >= all.len() {
                 return Err(error);
             }
-            let (count, total, why) = (out.left_out.len(), all.len(), reason(error));
+            let (total, why) = (all.len(), reason(error));
             out.assumptions
                 .push(format!("left out {count} of {total} frames without a usable camera, such as `{name}`: {why}"));
+        }
+        if let Some(first) = out.bad.first() {
+            let (count, total) = (out.bad.len(), all.len());
+            out.assumptions.push(format!("left out {count} of {total} frames that `is_bad` marks, such as `{first}`"));
         }
         out.assumptions.extend(moving(&all));
         out.assumptions.extend(masks::attach_dynamic(&mut out.views.iter_mut().flatten().collect::<Vec<_>>()));
@@ -106,8 +121,13 @@ impl Frames {
         let (mut rounded, mut blunt, mut shared) = (vec![], vec![], vec![]);
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
             check_known(frame)?;
+            if frame.flag("is_bad")? == Some(true) {
+                self.bad.push(name.clone());
+                self.left_out.insert(name.clone());
+                continue;
+            }
             let angle_y = dialect == Dialect::Transforms;
-            let pose = matrix::pose(frame, "transform_matrix")?;
+            let pose = matrix::pose(frame, "transform_matrix", self.scale)?;
             let pose = pose.and_then(|pose| layers[i].check_lengths(angle_y).map(|()| pose));
             let mut pose = match pose {
                 Ok(pose) => pose,
@@ -144,11 +164,12 @@ impl Frames {
             views.push(View {
                 image: image.as_ref().map(|image| image.path.clone()),
                 mask: needed(frame, "mask_path", &masks[i], image.is_some())?,
-                depth: depths.of_frame(i, &layers[i], image.is_some())?,
+                depth: depths.of_frame(i, &layers[i])?,
                 sharpness: unused(frame.number("sharpness"), &mut blunt),
                 ..View::new(name, &frame.path, camera)
             });
         }
+        self.assumptions.extend(depths.absent());
         self.assumptions.extend(short_depths(&views, folder));
         check_distinct(top, &views)?;
         check_same_camera(top, shared.into_iter().map(|i| &views[i]))?;
@@ -284,15 +305,20 @@ fn size(
     Ok(stored)
 }
 
-/// The file that accompanies an image. It must exist if the image does.
-fn needed(frame: &Object<'_>, member: &str, file: &Option<Named>, needed: bool) -> Result<Option<PathBuf>> {
-    match file {
+/// A file, if it exists.
+fn file(named: &Option<Named>) -> Option<PathBuf> {
+    named.as_ref().and_then(|(_, file)| Some(file.as_ref()?.path.clone()))
+}
+
+/// The mask of an image. It must exist if the image does.
+fn needed(frame: &Object<'_>, member: &str, named: &Option<Named>, needed: bool) -> Result<Option<PathBuf>> {
+    match named {
         Some((path, None)) if needed => {
             let what =
                 format!("there is no file {path}: copy it there, or remove the field to use the image without it");
             Err(frame.error(member, what))
         }
-        file => Ok(file.as_ref().and_then(|(_, file)| Some(file.as_ref()?.path.clone()))),
+        named => Ok(file(named)),
     }
 }
 
@@ -337,15 +363,22 @@ impl Depths {
     }
 
     /// The file and unit of a frame.
-    fn of_frame(&self, i: usize, layers: &Layers<'_, '_>, has_image: bool) -> Result<Option<(PathBuf, f64)>> {
-        if let Some(path) = needed(layers.frame, "depth_file_path", &self.nerfstudio[i], has_image)? {
+    fn of_frame(&self, i: usize, layers: &Layers<'_, '_>) -> Result<Option<(PathBuf, f64)>> {
+        if let Some(path) = file(&self.nerfstudio[i]) {
             // Float arrays are in scene units.
             let floats = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npy"));
             let default = if floats { 1.0 } else { DEPTH_UNIT };
             let unit = layers.find("depth_unit_scale_factor", |object, name| object.positive(name))?;
             return Ok(Some((path, unit.unwrap_or(default))));
         }
-        let path = needed(layers.frame, "depth_path", &self.ngp[i], has_image)?;
-        Ok(path.map(|path| (path, self.ngp_unit)))
+        Ok(file(&self.ngp[i]).map(|path| (path, self.ngp_unit)))
+    }
+
+    /// A note on depth files that do not exist. Training without depths does not need them.
+    fn absent(&self) -> Option<String> {
+        let all = || self.nerfstudio.iter().chain(&self.ngp).flatten();
+        let (first, _) = all().find(|(_, file)| file.is_none())?;
+        let count = all().filter(|(_, file)| file.is_none()).count();
+        Some(format!("{count} of {} depth files do not exist, such as `{first}`: left them out", all().count()))
     }
 }

@@ -13,7 +13,7 @@ use serde_json::{Map, Value};
 use std::f64::consts::PI;
 
 /// Unsupported camera fields of instant-ngp and nerfstudio. Ignoring them silently would spoil every image.
-const NOT_READ: [&str; 17] = [
+const NOT_READ: [&str; 18] = [
     "x_fov",
     "y_fov",
     "distortion_params",
@@ -31,7 +31,22 @@ const NOT_READ: [&str; 17] = [
     "transform_matrix_end",
     "black_transparent",
     "normal_mts_args",
+    "from_na",
 ];
+
+/// Names of texts that state the axes or the direction of the matrices. Those that name others than OpenGL's count.
+const CONVENTIONS: [&str; 9] = [
+    "convention",
+    "frame_convention",
+    "camera_convention",
+    "pose_convention",
+    "axis_convention",
+    "coordinate_convention",
+    "coordinate_system",
+    "coord_system",
+    "pose_type",
+];
+const OTHER_CONVENTIONS: [&str; 6] = ["opencv", "colmap", "w2c", "world2cam", "world_to_cam", "world-to-cam"];
 
 /// Lists of distortion coefficients in other programs. They count where none are given by name.
 const DISTORTIONS: [&str; 9] = [
@@ -86,6 +101,11 @@ const TURNED: f64 = 0.1;
 /// The least ratio of the sides of an image that has a turned shape.
 const OBLONG: f64 = 1.1;
 
+/// The relative distance of a principal point from the middle of a larger image that is that image's.
+const LARGER: f64 = 0.02;
+/// The longest side, in pixels, of an image whose principal point may be within one pixel of its corner.
+const SMALLEST: usize = 16;
+
 /// The relative difference of two focal lengths that is no rounding of a field of view.
 const DIFFERS: f64 = 0.01;
 
@@ -107,11 +127,16 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     // A number is a distance, and a text such as "none" no coefficient.
     let is_list = |value: &Value| value.is_array() || value.is_object();
     let lists = DISTORTIONS.iter().filter(|name| object.get("k1").is_none() && object.get(name).is_some_and(is_list));
-    let is_wide = |name: &&&str| {
+    let has_one = |name: &str, words: &[&str]| {
         let text = object.get(name).and_then(Value::as_str).map(str::to_lowercase);
-        object.get("camera_model").is_none() && text.is_some_and(|text| WIDE.iter().any(|kind| text.contains(kind)))
+        text.is_some_and(|text| words.iter().any(|word| text.contains(word)))
     };
-    let all = NOT_READ.iter().chain(lists).chain(KINDS.iter().filter(is_wide));
+    let is_fisheye = object.get("fisheye").and_then(Value::as_bool) == Some(true);
+    let is_wide = |name: &&&str| {
+        object.get("camera_model").is_none() && (has_one(name, &WIDE) || **name == "fisheye" && is_fisheye)
+    };
+    let conventions = CONVENTIONS.iter().filter(|name| has_one(name, &OTHER_CONVENTIONS));
+    let all = NOT_READ.iter().chain(lists).chain(KINDS.iter().filter(is_wide)).chain(conventions);
     let named = all.copied().find_map(|name| Some((name, object.get(name).filter(|value| !nothing(value))?)));
     let Some((name, value)) = named else { return Ok(()) };
     let what = match name {
@@ -130,6 +155,12 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
         }
         "normal_mts_args" => {
             "it means axes of Mitsuba: negate the first and the third column of all matrices, and remove it"
+        }
+        "from_na" => {
+            "it means axes of OpenCV (NeuS2): negate the second and the third column of all matrices, and remove it"
+        }
+        name if CONVENTIONS.contains(&name) => {
+            "matrices are camera-to-world with OpenGL's axes (y up, looking along -z): convert them, and remove it"
         }
         "black_transparent" => "write the transparency into the images; remove it to ignore it",
         _ => "such cameras are not supported; remove it to ignore it",
@@ -263,6 +294,11 @@ impl Layers<'_, '_> {
                 centre[0], centre[1], self.frame.path
             );
             return Err(self.top.error(name.filter(|_| self.top.get("cx").is_none()).unwrap_or("cx"), what));
+        }
+        if let ([Some(x), Some(y)], true) = (given, is_shared && width.min(height) > 0)
+            && let Some(what) = other_unit([x, y], [width, height], &self.frame.path)
+        {
+            return Err(self.error("cx", what));
         }
         let focal = self.focal([width, height], angle_y)?;
         Ok(Camera { width, height, focal, centre, lens, pose })
@@ -398,6 +434,28 @@ impl Layers<'_, '_> {
         }
         Ok(focal)
     }
+}
+
+/// What is wrong with a principal point in units of the image's sides, or in pixels of an image that is a few times
+/// larger.
+fn other_unit(centre: [f64; 2], sides: [usize; 2], frame: &str) -> Option<String> {
+    let [width, height] = sides;
+    if sides.iter().all(|side| *side > SMALLEST) && centre.iter().all(|x| (0.0..=1.0).contains(x) && *x > 0.0) {
+        return Some(format!(
+            "and `cy` are {} and {}, in units of the image's sides: multiply them by {width} and {height}",
+            centre[0], centre[1]
+        ));
+    }
+    let times = [0, 1].map(|i| 2.0 * centre[i] / sides[i] as f64);
+    let factor = times[0].round();
+    let is_middle = times.iter().all(|times| (times / factor - 1.0).abs() < LARGER);
+    (factor >= 2.0 && is_middle).then(|| {
+        let [large, high] = sides.map(|side| side as f64 * factor);
+        format!(
+            "and `cy` are the middle of {large}x{high} pixels, but {frame} has {width}x{height}: give `w` and `h` of the \
+             larger image, or each frame's own `cx` and `cy` if the images are crops"
+        )
+    })
 }
 
 /// The focal lengths that one object gives: `fl_x` and `fl_y`, or else the angles.

@@ -403,10 +403,13 @@ fn parts(path: &Path) -> Vec<String> {
         .collect()
 }
 
+/// The largest factor of a folder of downscaled images. Larger numbers are no factors, such as the year of `images_2024`.
+const LARGEST_FACTOR: usize = 32;
+
 /// The factor of a path in a folder of downscaled images, such as `images_4`; 1 for other paths.
 pub(in crate::dataset) fn factor_of(inside: &Path) -> usize {
     let factor = |part: Component<'_>| part.as_os_str().to_str()?.strip_prefix("images_")?.parse().ok();
-    inside.components().find_map(factor).filter(|factor| *factor > 0).unwrap_or(1)
+    inside.components().find_map(factor).filter(|factor| (1..=LARGEST_FACTOR).contains(factor)).unwrap_or(1)
 }
 
 #[cfg(test)]

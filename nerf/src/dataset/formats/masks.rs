@@ -1,6 +1,6 @@
 //! Masks in a folder beside the images, and dynamic masks among them.
 
-use super::locate::{folders, stem};
+use super::locate::{IMAGES, folders, stem};
 use super::paths::{extension, folded};
 use crate::dataset::capture::{Capture, View};
 use crate::error::{Error, Result};
@@ -22,10 +22,12 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) -> Result<()> {
     let mut listings = HashMap::new();
     for view in &mut capture.views {
         // COLMAP's own naming comes first.
-        let own = Path::new(&view.name);
-        let others = ["jpg", "jpeg", "webp"].map(|ending| own.with_extension(ending));
-        let names = [format!("{}.png", view.name).into(), own.with_extension("png"), own.to_owned()];
-        let names: Vec<PathBuf> = names.into_iter().chain(others).collect();
+        let names = [Path::new(&view.name)].into_iter().chain(inner(&view.name)).flat_map(|own| {
+            let whole = PathBuf::from(format!("{}.png", own.display()));
+            let others = ["jpg", "jpeg", "webp"].map(|ending| own.with_extension(ending));
+            [whole, own.with_extension("png"), own.to_owned()].into_iter().chain(others)
+        });
+        let names: Vec<PathBuf> = names.collect();
         let mut paths = folders.iter().flat_map(|folder| names.iter().map(move |name| folder.join(name)));
         let exact = paths.clone().find(|path| path.is_file());
         view.mask = exact.or_else(|| paths.find_map(|path| in_any_case(&mut listings, &path)));
@@ -62,6 +64,31 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) -> Result<()> {
         capture.assumptions.push(what);
     }
     Ok(())
+}
+
+/// [`attach`] for a file whose frames list no masks.
+///
+/// # Errors
+/// If a mask fits two images.
+pub(super) fn attach_unlisted(capture: &mut Capture) -> Result<()> {
+    if capture.views.iter().any(|view| view.mask.is_some()) {
+        return Ok(());
+    }
+    attach(capture, &[capture.folder.clone()])?;
+    let mask = capture.present().find_map(|view| view.mask.clone());
+    if let Some(mask) = mask {
+        let mask = mask.strip_prefix(&capture.folder).unwrap_or(&mask).display();
+        let what = format!("no frame lists a mask: used those beside them, such as `{mask}` (white is used)");
+        capture.assumptions.push(what);
+    }
+    Ok(())
+}
+
+/// The path of an image below its folder of images, if it starts with one.
+fn inner(name: &str) -> Option<&Path> {
+    let (folder, inner) = name.split_once('/')?;
+    let folder = folded(folder);
+    (IMAGES.contains(&&*folder) || folder.starts_with("images_")).then(|| Path::new(inner))
 }
 
 /// The start of the names of instant-ngp's dynamic masks.

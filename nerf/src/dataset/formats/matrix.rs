@@ -21,12 +21,35 @@ pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>
 }
 
 /// Reads a camera-to-world matrix: a rotation, up to [`ROUNDED`], and a translation. The inner error is that of a matrix
-/// that some programs write where they found no pose: none, an empty one, zeros, or numbers that are not finite.
-pub(super) fn pose(object: &Object<'_>, name: &str) -> Result<Result<DAffine3>> {
+/// that some programs write where they found no pose: none, an empty one, zeros, or numbers that are not finite. The
+/// rotation is divided by a `scale`.
+pub(super) fn pose(object: &Object<'_>, name: &str, scale: Option<f64>) -> Result<Result<DAffine3>> {
+    let rigid = |mut transform: DAffine3| {
+        transform.matrix3 = transform.matrix3 * scale.unwrap_or(1.0).recip();
+        rigid(transform)
+    };
     let matrix = object.required(name);
     let is_none = matrix.as_ref().map_or(true, |matrix| entries(matrix, 4).is_some_and(|entries| has_none(&entries)));
     let pose = matrix.and_then(|matrix| transform(matrix).and_then(rigid).map_err(|what| object.error(name, what)));
     if is_none { Ok(pose) } else { pose.map(Ok) }
+}
+
+/// The scale that all matrices of frames have in place of rotations, if it is one and not 1: that of a Blender camera's
+/// parent, or of IDR's scene. Those without a pose do not count.
+pub(super) fn shared_scale(frames: &[&Object<'_>], name: &str) -> Option<f64> {
+    let mut scales = frames.iter().filter_map(|frame| {
+        let m = transform(frame.get(name)?).ok()?.matrix3;
+        let scale = scale_of(&m);
+        (scale != 0.0).then_some((scale, is_orthonormal(&(m * scale.recip()), TOLERANCE)))
+    });
+    let (first, is_rotation) = scales.next()?;
+    let is_shared = scales.all(|(scale, is_rotation)| is_rotation && (scale / first - 1.0).abs() < TOLERANCE);
+    (is_rotation && is_shared && (first - 1.0).abs() > ROUNDED).then_some(first)
+}
+
+/// The mean length of the columns.
+fn scale_of(m: &DMat3) -> f64 {
+    (m.x_axis.length() + m.y_axis.length() + m.z_axis.length()) / 3.0
 }
 
 /// Returns true if the entries of a matrix say that there is no pose. JavaScript writes null for NaN.
@@ -87,7 +110,7 @@ fn transform(matrix: &Value) -> std::result::Result<DAffine3, String> {
 /// Checks that a transform is a rotation, up to [`ROUNDED`], and a translation; returns it or an error message.
 fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
     let m = transform.matrix3;
-    let scale = (m.x_axis.length() + m.y_axis.length() + m.z_axis.length()) / 3.0;
+    let scale = scale_of(&m);
     let scales = scale > 0.0 && scale.is_finite() && is_orthonormal(&(m * scale.recip()), TOLERANCE);
     if scales && !is_orthonormal(&m, TOLERANCE) {
         return Err(format!(

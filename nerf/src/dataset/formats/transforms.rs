@@ -6,7 +6,7 @@
 use super::frames::{Dialect, Frames};
 use super::json::{self, Object, first_of, shown, unused};
 use super::locate::{fitting, stem};
-use super::{intrinsics, lens, matrix, paths, ply};
+use super::{intrinsics, lens, masks, matrix, paths, ply};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
@@ -32,11 +32,10 @@ pub(super) fn file(folder: &Path) -> PathBuf {
 ///
 /// Splits come from `train_filenames`, `val_filenames` and `test_filenames`; an image in both of the latter, as
 /// nerfstudio writes for a single held-out set, is a test image. Absent and damaged points are left out, which
-/// [`Capture::assumptions`] says.
+/// [`Capture::assumptions`] says. So are absent depth files. If no frame lists a mask, those of a folder `masks` are used.
 ///
 /// # Errors
-/// If the file cannot be read, lacks a field, or has a field that is wrong or unsupported. If a mask or depth file is
-/// absent.
+/// If the file cannot be read, lacks a field, or has a field that is wrong or unsupported. If a listed mask is absent.
 pub fn read(folder: &Path) -> Result<Capture> {
     read_file(folder, &file(folder), true)
 }
@@ -70,6 +69,7 @@ pub(super) fn read_file(folder: &Path, file: &Path, needed: bool) -> Result<Capt
         let file = if beside.exists() { beside } else { folder.join(path) };
         ply::read(&file).attach(&mut capture, &file);
     }
+    masks::attach_unlisted(&mut capture)?;
     Ok(capture)
 }
 

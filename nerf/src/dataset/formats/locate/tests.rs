@@ -177,6 +177,11 @@ fn downscaled_images_count_after_those_of_full_size() {
     assert_eq!(located[0].as_ref().unwrap().factor, 4);
     let located = locate(&folder, &["images_4/0.png"], &HashSet::new(), &mut vec![]).unwrap();
     assert_eq!(located[0].as_ref().unwrap().factor, 1, "as listed");
+    for (name, expected) in
+        [("images_8/0.png", 8), ("images_2024/0.png", 1), ("images_0/0.png", 1), ("images_a/0.png", 1)]
+    {
+        assert_eq!(factor_of(Path::new(name)), expected, "{name}");
+    }
 }
 
 #[test]

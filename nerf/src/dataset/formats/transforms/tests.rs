@@ -316,7 +316,11 @@ fn masks_depths_and_sharpness_are_read() {
     let at = |name: &str| folder.path().join(name);
     says(&failure(read(folder.path()), FILE), &["`frames[0].mask_path`: there is no file masks/0.png"]);
     picture(&at("masks/0.png"), 8, 6);
-    says(&failure(read(folder.path()), FILE), &["`frames[0].depth_file_path`: there is no file depth/0.png"]);
+    // Training without depths does not need them.
+    let capture = read(folder.path()).unwrap();
+    assert!(capture.views.iter().all(|view| view.depth.is_none()));
+    let expected = "2 of 2 depth files do not exist, such as `depth/0.png`: left them out";
+    assert!(capture.assumptions.iter().any(|what| what == expected), "{:?}", capture.assumptions);
     picture(&at("depth/0.png"), 8, 6);
     std::fs::write(at("depth/1.npy"), b"").unwrap();
     let views = read(folder.path()).unwrap().views;
@@ -343,6 +347,26 @@ fn masks_depths_and_sharpness_are_read() {
     assert_eq!(units("enable_depth_loading", json!(false)), [Some(1e-3), Some(1.0), None]);
     let message = with("depth_unit_scale_factor", json!(0)).unwrap_err().to_string();
     says(&message, &["`depth_unit_scale_factor`: must be above 0, is 0"]);
+}
+
+#[test]
+fn masks_beside_frames_without_masks_are_used() {
+    let folder = folder(|_| {});
+    let at = |name: &str| folder.path().join(name);
+    picture(&at("masks/0.png"), 8, 6);
+    picture(&at("masks/images/1.png"), 8, 6);
+    let capture = read(folder.path()).unwrap();
+    let masks: Vec<_> = capture.views.iter().map(|view| view.mask.clone()).collect();
+    assert_eq!(masks, [Some(at("masks/0.png")), Some(at("masks/images/1.png")), None]);
+    let note = "no frame lists a mask: used those beside them, such as `masks/0.png` (white is used)";
+    assert_eq!(capture.assumptions, [note]);
+    // A single listed mask states which are used.
+    let mut document = document();
+    document["frames"][1]["mask_path"] = json!("masks/0.png");
+    std::fs::write(at(FILE), document.to_string()).unwrap();
+    let capture = read(folder.path()).unwrap();
+    let masks: Vec<_> = capture.views.iter().map(|view| view.mask.clone()).collect();
+    assert_eq!((masks, capture.assumptions), (vec![None, Some(at("masks/0.png")), None], vec![]));
 }
 
 #[test]
@@ -467,7 +491,7 @@ fn aabb_scale_is_read_other_fields_are_ignored() {
     assert_eq!(good(|d| d["aabb_scale"] = json!(4)).aabb_scale, Some(4.0));
     let harmless = json!({ "n_frames": 2, "up": [0, 0, 1], "white_transparent": true, "orientation_override": "none",
         "auto_scale_poses_override": false, "colmap_im_id": 3, "sharpness_discard_threshold": 1, "rotation": 0.1,
-        "from_na": true, "ply_file_path": "absent.ply", "anything": { "else": [1] } });
+        "from_na": false, "coordinate_system": "opengl", "ply_file_path": "absent.ply", "anything": { "else": [1] } });
     let capture = good(|d| {
         d.as_object_mut().unwrap().extend(harmless.as_object().unwrap().clone());
         d["frames"][0]["colmap_im_id"] = json!(17);
@@ -478,6 +502,89 @@ fn aabb_scale_is_read_other_fields_are_ignored() {
     );
     assert_eq!((capture.points, capture.points_file), (vec![], None));
     assert_eq!(capture.assumptions, ["left out the points of `absent.ply`: there is no such file"]);
+}
+
+#[test]
+fn other_conventions_that_the_file_states_are_errors() {
+    for (name, value, what) in [
+        ("from_na", json!(true), "axes of OpenCV (NeuS2): negate the second and the third column"),
+        ("frame_convention", json!("OpenCV"), "OpenGL's axes (y up, looking along -z)"),
+        ("coordinate_system", json!("colmap"), "convert them, and remove it"),
+        ("pose_type", json!("w2c"), "camera-to-world"),
+        ("fisheye", json!(true), "write camera_model OPENCV_FISHEYE"),
+    ] {
+        fails(|d| d[name] = value.clone(), &[&format!("`{name}`: is "), what]);
+        fails(|d| d["frames"][1][name] = value, &[&format!("`frames[1].{name}`: is "), what]);
+    }
+    good(|d| (d["frame_convention"], d["pose_type"], d["fisheye"]) = (json!("opengl"), json!("c2w"), json!(false)));
+    good(|d| (d["fisheye"], d["camera_model"]) = (json!(true), json!("OPENCV_FISHEYE")));
+}
+
+#[test]
+fn one_scale_of_all_rotations_is_divided_out() {
+    let scaled = |scales: [f64; 3]| {
+        move |d: &mut Value| {
+            for (i, scale) in scales.into_iter().enumerate() {
+                for (r, c) in (0..9).map(|k| (k / 3, k % 3)) {
+                    let entry = &mut d["frames"][i]["transform_matrix"][r][c];
+                    *entry = json!(scale * entry.as_f64().unwrap());
+                }
+            }
+        }
+    };
+    let poses = |capture: &Capture| capture.views.iter().map(|view| view.camera.pose).collect::<Vec<_>>();
+    let (plain, halves) = (good(|_| {}), good(scaled([0.5; 3])));
+    for (a, b) in poses(&plain).iter().zip(poses(&halves)) {
+        assert!(a.abs_diff_eq(b, 1e-12), "{a:?} {b:?}");
+    }
+    let note = "all rotations scale by 0.500000: divided them by it, and left the positions as they are";
+    assert_eq!(halves.assumptions, [note]);
+    fails(scaled([0.5, 0.5, 1.0]), &["`frames[0].transform_matrix`", "but scales by 0.500000"]);
+    fails(scaled([0.5, 0.4, 0.5]), &["but scales by 0.500000"]);
+}
+
+#[test]
+fn frames_that_are_marked_as_bad_are_left_out() {
+    let capture = good(|d| (d["frames"][0]["is_bad"], d["frames"][1]["is_bad"]) = (json!(true), json!(false)));
+    assert_eq!(capture.views.len(), 2);
+    assert_eq!(capture.assumptions, ["left out 1 of 3 frames that `is_bad` marks, such as `images/0.png`"]);
+}
+
+#[test]
+fn principal_points_in_other_units_are_errors() {
+    let folder = tempfile::tempdir().unwrap();
+    picture(&folder.path().join("images/0.png"), 64, 48);
+    picture(&folder.path().join("images/1.png"), 64, 48);
+    let read_with = |change: &dyn Fn(&mut Value)| {
+        let mut document = document();
+        for name in ["w", "h", "cx", "cy", "fl_x", "fl_y"] {
+            document.as_object_mut().unwrap().remove(name);
+        }
+        document["fl_x"] = json!(60);
+        change(&mut document);
+        std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+        read(folder.path()).map_err(|error| error.to_string())
+    };
+    let centre = |x: f64, y: f64| move |d: &mut Value| (d["cx"], d["cy"]) = (json!(x), json!(y));
+    for (x, y, what) in [
+        (64.0, 48.0, "the middle of 128x96 pixels, but frames[0] has 64x48: give `w` and `h` of the larger image"),
+        (64.5, 47.6, "the middle of 128x96 pixels"),
+        (0.5, 0.49, "in units of the image's sides: multiply them by 64 and 48"),
+    ] {
+        let message = read_with(&centre(x, y)).unwrap_err();
+        assert!(message.contains("`cx`: and `cy` are ") && message.contains(what), "{message}");
+    }
+    for (x, y) in [(32.0, 24.0), (30.0, 1.0), (64.0, 30.0), (60.0, 46.0), (-0.5, 0.5)] {
+        assert!(read_with(&centre(x, y)).is_ok(), "{x} {y}");
+    }
+    // With the size that it belongs to, and a frame's own.
+    let sized = |d: &mut Value| {
+        centre(64.0, 48.0)(d);
+        (d["w"], d["h"]) = (json!(128), json!(96));
+    };
+    assert_eq!(read_with(&sized).unwrap().views[0].camera.centre, [64.0, 48.0]);
+    let own = |d: &mut Value| (0..3).for_each(|i| centre(64.0, 48.0)(&mut d["frames"][i]));
+    assert!(read_with(&own).is_ok());
 }
 
 #[test]
