@@ -30,10 +30,12 @@ fn broken() -> NpyError {
 /// If the shape has another number of elements.
 pub fn encode<T: Scalar>(shape: &[usize], values: &[T]) -> Vec<u8> {
     assert_eq!(shape.iter().product::<usize>(), values.len(), "elements of an array of shape {shape:?}");
-    // A tuple of one element has a comma, and a list of several may end in one.
-    let extents: String = shape.iter().map(|extent| format!("{extent}, ")).collect();
-    let mut text =
-        format!("{{'descr': '{}', 'fortran_order': False, 'shape': ({}), }}", descr::<T>(), extents.trim_end());
+    let mut extents = shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ");
+    if shape.len() == 1 {
+        // Python's tuple of one element.
+        extents.push(',');
+    }
+    let mut text = format!("{{'descr': '{}', 'fortran_order': False, 'shape': ({extents}), }}", descr::<T>());
     let long = text.len() > usize::from(u16::MAX) - 128;
     let prefix = if long { 12 } else { 10 };
     // The elements start at a multiple of 64 bytes.
@@ -183,6 +185,11 @@ mod tests {
             encode::<f32>(&[], &[0.0])
                 .starts_with(b"\x93NUMPY\x01\x00\x76\x00{'descr': '<f4', 'fortran_order': False, 'shape': (), }")
         );
+        for (shape, written) in [(&[3][..], "(3,)"), (&[1, 3], "(1, 3)"), (&[3, 1, 1], "(3, 1, 1)")] {
+            let bytes = encode(shape, &[0.0_f32; 3]);
+            let header = String::from_utf8_lossy(&bytes[10..128]);
+            assert!(header.contains(&format!("'shape': {written}, }}")), "{header}");
+        }
         assert!(encode::<f64>(&[0], &[]).ends_with(b" \n"));
         for text in [
             "{'descr': '<f4', 'fortran_order': False, 'shape': (3,), }",

@@ -169,7 +169,7 @@ impl Frames {
                 ..View::new(name, &frame.path, camera)
             });
         }
-        self.assumptions.extend(depths.absent());
+        self.assumptions.extend(depths.absent(images));
         self.assumptions.extend(short_depths(&views, folder));
         check_distinct(top, &views)?;
         check_same_camera(top, shared.into_iter().map(|i| &views[i]))?;
@@ -374,9 +374,10 @@ impl Depths {
         Ok(file(&self.ngp[i]).map(|path| (path, self.ngp_unit)))
     }
 
-    /// A note on depth files that do not exist. Training without depths does not need them.
-    fn absent(&self) -> Option<String> {
-        let all = || self.nerfstudio.iter().chain(&self.ngp).flatten();
+    /// A note on depth files of existing images that do not exist. Training without depths does not need them.
+    fn absent(&self, images: &[Named]) -> Option<String> {
+        let of_images = |depths| images.iter().zip(depths).filter(|((_, image), _)| image.is_some());
+        let all = || of_images(&self.nerfstudio).chain(of_images(&self.ngp)).filter_map(|(_, depth)| depth.as_ref());
         let (first, _) = all().find(|(_, file)| file.is_none())?;
         let count = all().filter(|(_, file)| file.is_none()).count();
         Some(format!("{count} of {} depth files do not exist, such as `{first}`: left them out", all().count()))

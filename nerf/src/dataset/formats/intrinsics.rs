@@ -295,12 +295,12 @@ impl Layers<'_, '_> {
             );
             return Err(self.top.error(name.filter(|_| self.top.get("cx").is_none()).unwrap_or("cx"), what));
         }
+        let focal = self.focal([width, height], angle_y)?;
         if let ([Some(x), Some(y)], true) = (given, is_shared && width.min(height) > 0)
             && let Some(what) = other_unit([x, y], [width, height], &self.frame.path)
         {
-            return Err(self.error("cx", what));
+            return Err(self.top.error("cx", what));
         }
-        let focal = self.focal([width, height], angle_y)?;
         Ok(Camera { width, height, focal, centre, lens, pose })
     }
 

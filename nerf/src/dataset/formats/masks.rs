@@ -74,7 +74,8 @@ pub(super) fn attach_unlisted(capture: &mut Capture) -> Result<()> {
     if capture.views.iter().any(|view| view.mask.is_some()) {
         return Ok(());
     }
-    attach(capture, &[capture.folder.clone()])?;
+    let root = capture.folder.clone();
+    attach(capture, &[root])?;
     let mask = capture.present().find_map(|view| view.mask.clone());
     if let Some(mask) = mask {
         let mask = mask.strip_prefix(&capture.folder).unwrap_or(&mask).display();

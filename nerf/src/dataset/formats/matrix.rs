@@ -25,7 +25,7 @@ pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>
 /// rotation is divided by a `scale`.
 pub(super) fn pose(object: &Object<'_>, name: &str, scale: Option<f64>) -> Result<Result<DAffine3>> {
     let rigid = |mut transform: DAffine3| {
-        transform.matrix3 = transform.matrix3 * scale.unwrap_or(1.0).recip();
+        transform.matrix3 *= scale.unwrap_or(1.0).recip();
         rigid(transform)
     };
     let matrix = object.required(name);

@@ -153,6 +153,8 @@ fn absent_fields_are_not_written() {
     for view in &mut capture.views {
         (view.split, view.mask, view.depth, view.sharpness) = (None, None, None, None);
     }
+    // Without listed masks, those of this folder would be used.
+    std::fs::remove_dir_all(folder.path().join("masks")).unwrap();
     let (again, document) = written(&capture);
     assert_eq!(again, capture);
     let absent = ["applied_transform", "aabb_scale", "ply_file_path", "train_filenames", "depth_unit_scale_factor"];
