@@ -149,6 +149,8 @@ fn unsupported_formats_are_refused_before_writing() {
             && said.contains("1 masks are not converted: LLFF has none"),
         "{said}"
     );
+    // Without listed masks, those of this folder would be used.
+    std::fs::remove_dir_all(place.path("scene/masks")).unwrap();
     // Two images whose names would collide in one folder.
     std::fs::copy(place.path("scene/images/7.png"), place.path("scene/images/more_9.png")).unwrap();
     let mut transforms = place.json("scene/transforms.json");
@@ -213,6 +215,8 @@ fn undistorted_images_fit_every_format() {
 fn differing_cameras_become_one_where_needed() {
     let place = Place::empty();
     with_lens(&place);
+    // Without listed masks, those of this folder would be used.
+    std::fs::remove_dir_all(place.path("scene/masks")).unwrap();
     let mut transforms = place.json("scene/transforms.json");
     for (i, frame) in transforms["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
         frame.as_object_mut().unwrap().remove("mask_path");
