@@ -21,16 +21,16 @@ const FEWEST: usize = 8;
 const DEVIATIONS: f64 = 4.0;
 /// The agreement of good cameras.
 const GOOD: f64 = 0.2;
-/// Above this agreement, no other reading of the poses is tried.
+/// Above this agreement, no hypothesis about the poses is tried.
 const CLEAR: f64 = 0.7;
 /// Below this agreement, images and cameras do not match. The report calls it poor.
 const NONE: f64 = 0.1;
 /// An image is wrong if its agreement is below this share of the median.
 const WRONG: f64 = 0.35;
 
-/// Another reading of the poses.
+/// What may be wrong with all poses.
 #[derive(Clone, Copy)]
-enum Reading {
+enum Hypothesis {
     Convention(Convention),
     Order(Order),
 }
@@ -49,16 +49,17 @@ pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Fin
         let names: Vec<&str> = all.iter().map(|(view, _)| &view.name[..]).collect();
         let conventions = Convention::ALL[1..]
             .iter()
-            .map(|&convention| (Reading::Convention(convention), placed(&|i| convention.apply(poses[i]))));
+            .map(|&convention| (Hypothesis::Convention(convention), placed(&|i| convention.apply(poses[i]))));
         let orders = Order::ALL.iter().filter_map(|&order| {
             let from = order.poses(&names)?;
-            Some((Reading::Order(order), placed(&|i| poses[from[i]])))
+            Some((Hypothesis::Order(order), placed(&|i| poses[from[i]])))
         });
-        let tallies = conventions.chain(orders).map(|(reading, placed)| (reading, total(&compare(&placed, &tried))));
+        let tallies =
+            conventions.chain(orders).map(|(hypothesis, placed)| (hypothesis, total(&compare(&placed, &tried))));
         let enough = tallies.filter(|(_, tally)| tally.trials >= ENOUGH);
         let best = enough.max_by(|a, b| a.1.skill().total_cmp(&b.1.skill()));
-        if let Some((reading, tally)) = best.filter(|(_, tally)| is_better(tally.skill(), own)) {
-            another(reading, [own, tally.skill()], findings);
+        if let Some((hypothesis, tally)) = best.filter(|(_, tally)| is_better(tally.skill(), own)) {
+            another(hypothesis, [own, tally.skill()], findings);
             return Some(own);
         }
     }
@@ -75,7 +76,7 @@ pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Fin
     Some(total(&pairs).skill())
 }
 
-/// Returns true if images agree so much better under another reading that the one as read is wrong.
+/// Returns true if images agree so much better under a hypothesis that the poses as read are wrong.
 fn is_better(other: f64, own: f64) -> bool {
     other > GOOD && (other > 2.0 * own || 1.0 - other < 0.5 * (1.0 - own))
 }
@@ -86,15 +87,15 @@ fn total(pairs: &[Pair]) -> Tally {
     total
 }
 
-/// Adds the finding that images match under another reading.
-fn another(reading: Reading, [own, other]: [f64; 2], findings: &mut Findings) {
+/// Adds the finding that images match under a hypothesis.
+fn another(hypothesis: Hypothesis, [own, other]: [f64; 2], findings: &mut Findings) {
     // The images decide, so findings from poses alone are obsolete.
     findings.0.retain(|finding| {
         !matches!(finding.kind, Kind::LooksAway | Kind::OpenCvAxes | Kind::WorldToCamera | Kind::OnePlace)
     });
-    let finding = match reading {
-        Reading::Order(order) => findings.add(Kind::PoseOrder, &[&order.text()]),
-        Reading::Convention(convention) => match convention {
+    let finding = match hypothesis {
+        Hypothesis::Order(order) => findings.add(Kind::PoseOrder, &[&order.text()]),
+        Hypothesis::Convention(convention) => match convention {
             Convention::AsRead => return,
             Convention::OpenCv => findings.add(Kind::OpenCvAxes, &[]),
             Convention::UpsideDown | Convention::Mitsuba => findings.add(Kind::TurnedCameras, &[]),
@@ -105,15 +106,15 @@ fn another(reading: Reading, [own, other]: [f64; 2], findings: &mut Findings) {
         },
     };
     finding.what += &format!(" (agreement {other:.2} if changed, {own:.2} as read)");
-    finding.advice += match reading {
-        Reading::Convention(Convention::WorldToOpenCv) => {
+    finding.advice += match hypothesis {
+        Hypothesis::Convention(Convention::WorldToOpenCv) => {
             " Then negate the second and third columns: the camera axes are OpenCV's."
         }
-        Reading::Convention(Convention::UpsideDown) => {
+        Hypothesis::Convention(Convention::UpsideDown) => {
             " These are the first and the second one. Or turn the images, if their EXIF orientation counts in the poses \
              alone."
         }
-        Reading::Convention(Convention::Mitsuba) => {
+        Hypothesis::Convention(Convention::Mitsuba) => {
             " These are the first and the third one: the camera axes are Mitsuba's."
         }
         _ => "",
@@ -153,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn other_readings_must_agree_far_better() {
+    fn hypotheses_must_agree_far_better() {
         // Twice the agreement, or half of the disagreement.
         for (other, own, expected) in [
             (0.45, 0.2, true),
