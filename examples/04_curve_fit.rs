@@ -5,8 +5,8 @@
 //! cargo run --release --example 04_curve_fit
 //! ```
 
+use rand::SeedableRng;
 use rand::rngs::StdRng;
-use rand::{RngExt, SeedableRng};
 use raygrad::{Adam, AdamConfig, Optimizer, Params, Schedule, Tape, Tensor, Var, derivatives::hvp};
 
 const POINTS: usize = 200;
@@ -49,12 +49,10 @@ fn deviations(loss: impl for<'t> Fn(&[Var<'t, f64>]) -> Var<'t, f64>, at: &Tenso
 
 fn main() {
     let mut rng = StdRng::seed_from_u64(1);
-    // The sum of twelve uniform numbers is close to a normal one.
-    let mut normal = || (0..12).map(|_| rng.random_range(-0.5..0.5)).sum::<f64>();
     let t = Tensor::from_fn(&[POINTS], |i| i as f64 * 8.0 / POINTS as f64);
     let tape = Tape::new();
     let exact = oscillation(&tape.constant(Tensor::from(TRUTH)), &tape.constant(t.clone()));
-    let data = Tensor::from_fn(&[POINTS], |i| exact.value()[[i]] + NOISE * normal());
+    let data = exact.value() + &Tensor::normal(&[POINTS], 0.0, NOISE, &mut rng);
 
     let mut params = Params::<f64>::new();
     let id = params.add("oscillation", Tensor::from([1.0, 0.1, 2.0, 0.0]));

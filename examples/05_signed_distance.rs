@@ -3,7 +3,7 @@
 //! (Gropp et al. 2020). The gradient by position is part of the loss, so training differentiates a gradient.
 //!
 //! ```text
-//! cargo run --release --example 05_signed_distance [folder for the picture]
+//! cargo run --release --example 05_signed_distance [folder for the image]
 //! ```
 //!
 //! Takes less than a minute.
@@ -21,7 +21,7 @@ use std::path::PathBuf;
 const STEPS: u64 = 3000;
 /// Points on the curve, and as many anywhere, in each step.
 const BATCH: usize = 256;
-/// The picture shows -SIDE..SIDE, on so many pixels.
+/// The image shows -SIDE..SIDE, on so many pixels.
 const SIDE: f32 = 1.2;
 const PIXELS: usize = 400;
 
@@ -67,13 +67,13 @@ fn color(d: f32) -> [f32; 3] {
     hue.map(|c: f32| c * shade)
 }
 
-fn picture(distances: impl Iterator<Item = f32>) -> Image {
+fn image(distances: impl Iterator<Item = f32>) -> Image {
     Image { data: distances.flat_map(color).collect(), ..Image::new(PIXELS, PIXELS, 3) }
 }
 
 fn main() -> raygrad::nerf::Result<()> {
     let folder = PathBuf::from(std::env::args().nth(1).unwrap_or("target/examples-out".into()));
-    std::fs::create_dir_all(&folder).expect("the folder for pictures can be made");
+    std::fs::create_dir_all(&folder).expect("the folder for images can be made");
     let mut rng = StdRng::seed_from_u64(5);
     let mut params = Params::<f32>::new();
     let mut network = Sequential::new();
@@ -120,12 +120,12 @@ fn main() -> raygrad::nerf::Result<()> {
     let truth: Vec<f32> = pixels.iter().map(|&at| exact_distance(&border, at)).collect();
     let mean = |errors: &mut dyn Iterator<Item = f32>| errors.sum::<f32>() / pixels.len() as f32;
     println!(
-        "Over the picture, distances are off by {:.4},",
+        "Over the image, distances are off by {:.4},",
         mean(&mut found.iter().zip(&truth).map(|(f, t)| (f - t).abs()))
     );
     println!("and slopes off 1 by {:.4}, in the mean.", mean(&mut slope.iter().map(|s| (s - 1.0).abs())));
     let path = folder.join("05_signed_distance.png");
-    Image::hconcat(&[&picture(found.iter().copied()), &picture(truth.into_iter())]).save_png(&path)?;
+    Image::hconcat(&[&image(found.iter().copied()), &image(truth.into_iter())]).save_png(&path)?;
     println!("{}: learned, exact", path.display());
     Ok(())
 }

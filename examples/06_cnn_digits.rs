@@ -1,12 +1,12 @@
-//! Why images are read with convolutions: digits that stand anywhere in a small noisy picture, once told apart by a linear
-//! function of the pixels and once by a network of two convolutions. Both see the same pictures; only the convolutions
+//! Why images are read with convolutions: digits that stand anywhere in a small noisy image, once told apart by a linear
+//! function of the pixels and once by a network of two convolutions. Both see the same images; only the convolutions
 //! recognise a stroke wherever it stands.
 //!
 //! ```text
 //! cargo run --release --example 06_cnn_digits
 //! ```
 //!
-//! Takes some seconds. The pictures are drawn from a 5x7 bitmap font with random shifts, contrast and noise, so nothing is
+//! Takes some seconds. The images are drawn from a 5x7 bitmap font with random shifts, contrast and noise, so nothing is
 //! downloaded, and the test set is drawn with another seed than training.
 
 use rand::rngs::StdRng;
@@ -19,7 +19,7 @@ use raygrad::{
 const STEPS: u64 = 400;
 const BATCH: usize = 64;
 const TESTS: usize = 2000;
-/// Side of a picture.
+/// Side of an image.
 const SIDE: usize = 12;
 /// Rows and columns of a glyph.
 const GLYPH: [usize; 2] = [7, 5];
@@ -38,8 +38,8 @@ const FONT: [[u8; 7]; 10] = [
     [0b01110, 0b10001, 0b10001, 0b01111, 0b00001, 0b00010, 0b01100],
 ];
 
-/// Pictures `[count, 1, SIDE, SIDE]` of random digits, and which digits they are.
-fn pictures(count: usize, rng: &mut StdRng) -> (Tensor<f32>, Vec<u32>) {
+/// Images `[count, 1, SIDE, SIDE]` of random digits, and which digits they are.
+fn images(count: usize, rng: &mut StdRng) -> (Tensor<f32>, Vec<u32>) {
     let mut pixels = Vec::with_capacity(count * SIDE * SIDE);
     let mut labels = Vec::with_capacity(count);
     for _ in 0..count {
@@ -63,7 +63,7 @@ fn pixels(params: &mut Params<f32>, rng: &mut StdRng) -> Sequential<f32> {
     Sequential::new().map(|x| x.reshape(&[x.shape()[0], INFER])).then(head)
 }
 
-/// 3x3 convolutions that halve the picture, and a linear function of what they find.
+/// 3x3 convolutions that halve the image, and a linear function of what they find.
 fn strokes(channels: &[usize], params: &mut Params<f32>, rng: &mut StdRng) -> Sequential<f32> {
     let same = Conv2dConfig { padding: [1, 1], ..Conv2dConfig::default() };
     let mut model = Sequential::new();
@@ -78,7 +78,7 @@ fn strokes(channels: &[usize], params: &mut Params<f32>, rng: &mut StdRng) -> Se
     model.map(|x| x.reshape(&[x.shape()[0], INFER])).then(head)
 }
 
-/// The share of pictures whose highest score is that of the right digit.
+/// The share of images whose highest score is that of the right digit.
 fn accuracy(model: &Sequential<f32>, params: &Params<f32>, (x, labels): &(Tensor<f32>, Vec<u32>)) -> f64 {
     let tape = Tape::new();
     let scores = model.forward(&params.bind_constant(&tape), &tape.constant(x.clone()), Mode::Evaluate);
@@ -89,12 +89,12 @@ fn accuracy(model: &Sequential<f32>, params: &Params<f32>, (x, labels): &(Tensor
 
 /// Trains a model and returns its accuracy on the test set.
 fn train(name: &str, params: &mut Params<f32>, model: &Sequential<f32>) -> f64 {
-    let test = pictures(TESTS, &mut StdRng::seed_from_u64(1));
+    let test = images(TESTS, &mut StdRng::seed_from_u64(1));
     let mut rng = StdRng::seed_from_u64(2);
     let mut adam = Adam::new(AdamConfig::default());
     println!("{name}, {} parameters:", params.elements());
     for step in 0..=STEPS {
-        let (x, labels) = pictures(BATCH, &mut rng);
+        let (x, labels) = images(BATCH, &mut rng);
         let tape = Tape::new();
         let bound = params.bind(&tape);
         let scores = model.forward(&bound, &tape.constant(x), Mode::Train(step));
@@ -110,11 +110,11 @@ fn train(name: &str, params: &mut Params<f32>, model: &Sequential<f32>) -> f64 {
 }
 
 fn main() {
-    let (x, labels) = pictures(3, &mut StdRng::seed_from_u64(0));
-    println!("Three pictures, of {labels:?}:");
+    let (x, labels) = images(3, &mut StdRng::seed_from_u64(0));
+    println!("Three images, of {labels:?}:");
     for row in 0..SIDE {
-        let line = |picture: usize| -> String {
-            let pixels = &x.as_slice()[(picture * SIDE + row) * SIDE..][..SIDE];
+        let line = |image: usize| -> String {
+            let pixels = &x.as_slice()[(image * SIDE + row) * SIDE..][..SIDE];
             pixels.iter().flat_map(|&x| [b" .:+#"[(x * 5.0).clamp(0.0, 4.0) as usize] as char; 2]).collect()
         };
         println!("  {}  |  {}  |  {}", line(0), line(1), line(2));

@@ -1,8 +1,8 @@
-//! Why NeRF encodes positions: a network that maps (x, y) to a colour learns one picture, once from the bare coordinates
+//! Why NeRF encodes positions: a network that maps (x, y) to a colour learns one image, once from the bare coordinates
 //! and once from their positional encoding. Without it the network finds only a blur.
 //!
 //! ```text
-//! cargo run --release --example fit_image [folder for the picture]
+//! cargo run --release --example fit_image [folder for the image]
 //! ```
 //!
 //! Takes about half a minute. It uses the tape, layers and optimizer of `raygrad` directly: nothing here is
@@ -24,7 +24,7 @@ const BATCH: usize = 4096;
 const TILE: usize = 512;
 const WIDTH: usize = 128;
 
-/// A picture as a function of position: encoding, three hidden layers, a colour.
+/// An image as a function of position: encoding, three hidden layers, a colour.
 struct Network {
     encoding: PositionalEncoding,
     trunk: Mlp,
@@ -53,7 +53,7 @@ fn positions(image: &Image, pixels: &[usize]) -> Tensor<f32> {
     Tensor::from_vec(&[pixels.len(), 2], pixels.iter().flat_map(at).collect())
 }
 
-/// What a network with `levels` frequencies makes of a picture.
+/// What a network with `levels` frequencies makes of an image.
 fn fit(truth: &Image, levels: usize) -> Image {
     let mut rng = StdRng::seed_from_u64(0);
     let mut params = Params::new();
@@ -81,22 +81,22 @@ fn fit(truth: &Image, levels: usize) -> Image {
     }
     let tape = Tape::new();
     let all: Vec<_> = (0..truth.width * truth.height).collect();
-    let picture = network.color(&params.bind_constant(&tape), &tape.constant(positions(truth, &all)));
-    Image { data: picture.value().as_slice().to_vec(), ..*truth }
+    let image = network.color(&params.bind_constant(&tape), &tape.constant(positions(truth, &all)));
+    Image { data: image.value().as_slice().to_vec(), ..*truth }
 }
 
 fn main() -> raygrad::nerf::Result<()> {
     let folder = PathBuf::from(std::env::args().nth(1).unwrap_or("target/examples-out".into()));
-    std::fs::create_dir_all(&folder).expect("the folder for pictures can be made");
+    std::fs::create_dir_all(&folder).expect("the folder for images can be made");
     let truth = Scene::bulldozer().render(&train_cameras(60, 200)[20], 9).color.over([1.0; 3]);
-    let pictures = [0, 7].map(|levels| {
+    let images = [0, 7].map(|levels| {
         println!("{levels} frequencies:");
-        let picture = fit(&truth, levels);
-        println!("  the whole picture: {:.2} dB", metrics::psnr(&picture, &truth));
-        picture
+        let image = fit(&truth, levels);
+        println!("  the whole image: {:.2} dB", metrics::psnr(&image, &truth));
+        image
     });
     let path = folder.join("fit_image.png");
-    Image::hconcat(&[&pictures[0], &pictures[1], &truth]).save_png(&path)?;
+    Image::hconcat(&[&images[0], &images[1], &truth]).save_png(&path)?;
     println!("{}: bare coordinates, encoded coordinates, truth", path.display());
     Ok(())
 }

@@ -6,9 +6,9 @@
 //!     [only=right|wrong|corrected] [every=10] [poses=1 focal_rate=1 coarse=0.4]
 //! ```
 //!
-//! Without a folder the embedded scene is photographed. It trains with the right cameras, with the wrong ones, and with the
+//! Without a folder the embedded scene is rendered. It trains with the right cameras, with the wrong ones, and with the
 //! wrong ones that are corrected, a minute or a number of steps each, and prints how far cameras are from the truth and how well new views are
-//! met. A scene and its cameras can turn, move and grow together without any photograph changing; so the true cameras are
+//! met. A scene and its cameras can turn, move and grow together without any image changing; so the true cameras are
 //! first brought to those that were found by the similarity that fits best.
 
 use rand::rngs::StdRng;
@@ -39,7 +39,7 @@ fn direction(rng: &mut StdRng) -> DVec3 {
     }
 }
 
-/// The same photographs, said to be from elsewhere.
+/// The same images, said to be from elsewhere.
 fn disturbed(data: &Dataset, degrees: f64, share: f64, factor: f64) -> Dataset {
     let mut wrong = data.clone();
     let (rng, size) = (&mut StdRng::seed_from_u64(7), (data.bounds[1] - data.bounds[0]).max_element());
@@ -126,7 +126,7 @@ fn main() -> Result<()> {
     refined.poses = faster(refined.poses, "poses");
     refined.camera_optimizer.focal = faster(refined.camera_optimizer.focal, "focal_rate");
     refined.camera_optimizer.coarse = number("coarse", refined.camera_optimizer.coarse);
-    println!("{} photographs, {budget:?} each", right.frames.len());
+    println!("{} images, {budget:?} each", right.frames.len());
     println!("cameras             turned (deg)  moved (% of scene)  focal length (%)  PSNR (dB)");
     let runs = [("right", &plain, &right), ("wrong", &plain, &wrong), ("wrong, corrected", &refined, &wrong)];
     for (name, config, data) in runs {

@@ -2,7 +2,7 @@
 //! Representations with Periodic Activation Functions").
 //!
 //! ```text
-//! cargo run --release --example siren [seconds] [folder for the picture and the model]
+//! cargo run --release --example siren [seconds] [folder for the image and the model]
 //! ```
 //!
 //! Trains for 60 seconds on the embedded scene unless told otherwise, saves the model, loads it, and draws it.
@@ -119,7 +119,7 @@ fn main() -> Result<()> {
     let mut args = std::env::args().skip(1);
     let seconds = args.next().map_or(60.0, |text| text.parse().expect("the first argument is a number of seconds"));
     let folder = PathBuf::from(args.next().unwrap_or("target/examples-out".into()));
-    std::fs::create_dir_all(&folder).expect("the folder for pictures can be made");
+    std::fs::create_dir_all(&folder).expect("the folder for images can be made");
 
     let [train, test] = [Split::Train, Split::Test].map(|split| embedded(split, 200));
     let field = SirenConfig { depth: 4, width: 96, frequency: 30.0 };

@@ -1,18 +1,19 @@
 //! What skipping costs and saves in rendering: a trained run's test views with and without it.
 //!
 //! ```text
-//! raygrad train path/to/scene --out run
+//! raygrad train --out run    # or train path/to/scene
 //! cargo run --release --example skip_error -- run [size in pixels]
 //! ```
 //!
 //! `box only` is the same model with every sample in the box evaluated: cells that training left empty are empty in it
-//! too, so its picture is that of `off`, which leaves those cells out and nothing else. `bare` asks the field in those
-//! cells as well, where no photograph ever judged it.
+//! too, so its image is that of `off`, which leaves those cells out and nothing else. `bare` asks the field in those
+//! cells as well, where no image ever judged it.
 
 use raygrad::nerf::dataset::{Capture, LoadOptions, Split};
 use raygrad::nerf::imaging::metrics::psnr;
 use raygrad::nerf::space::occupancy::{OccupancyGrid, Skip};
 use raygrad::nerf::{Camera, Config, Evaluations, Image, Model, SceneBox};
+use raygrad_scenes::embedded;
 use serde_json::Value;
 use std::error::Error;
 use std::path::Path;
@@ -28,15 +29,17 @@ fn main() -> Result<(), Box<dyn Error>> {
     let about: Value = serde_json::from_str(&std::fs::read_to_string(Path::new(&run).join("config.json"))?)?;
     let config: Config = serde_json::from_value(about["config"].clone())?;
     let extent: SceneBox = serde_json::from_value(about["scene_box"].clone())?;
-    let folder = about["scene"]["folder"].as_str().ok_or("the run's scene is not a folder")?;
     let mut model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
-    let capture = Capture::read(folder)?;
-    let views = capture.load(
-        Split::Test,
-        &capture.analyze_scene(None)?,
-        &LoadOptions { views: VIEWS, ..LoadOptions::default() },
-    )?;
-    let cameras: Vec<Camera> = views.frames.iter().map(|frame| frame.camera.resized(size, size)).collect();
+    let views = match (about["scene"].as_str(), about["scene"]["folder"].as_str()) {
+        (Some("embedded"), _) => embedded(Split::Test, 200),
+        (_, Some(folder)) => {
+            let capture = Capture::read(folder)?;
+            let options = LoadOptions { views: VIEWS, ..LoadOptions::default() };
+            capture.load(Split::Test, &capture.analyze_scene(None)?, &options)?
+        }
+        _ => return Err("the run's scene is neither `embedded` nor a folder".into()),
+    };
+    let cameras: Vec<Camera> = views.frames.iter().take(VIEWS).map(|frame| frame.camera.resized(size, size)).collect();
 
     model.set_skip(Skip::Off);
     let (unskipped, counts, seconds) = render(&model, &cameras);
@@ -72,8 +75,8 @@ fn main() -> Result<(), Box<dyn Error>> {
 /// The views in white, how often the field was asked in all, and the mean time of a view.
 fn render(model: &Model<f32>, cameras: &[Camera]) -> (Vec<Image>, Evaluations, f64) {
     let start = Instant::now();
-    let pictures: Vec<_> = cameras.iter().map(|camera| model.render(camera, [1.0; 3])).collect();
+    let images: Vec<_> = cameras.iter().map(|camera| model.render(camera, [1.0; 3])).collect();
     let seconds = start.elapsed().as_secs_f64() / cameras.len() as f64;
-    let counts = pictures.iter().fold(Evaluations::default(), |sum, picture| sum + picture.evaluations);
-    (pictures.into_iter().map(|picture| picture.color).collect(), counts, seconds)
+    let counts = images.iter().fold(Evaluations::default(), |sum, image| sum + image.evaluations);
+    (images.into_iter().map(|image| image.color).collect(), counts, seconds)
 }

@@ -2,7 +2,7 @@
 //! of rays of a trained run.
 //!
 //! ```text
-//! raygrad train path/to/scene --out run
+//! raygrad train --out run    # or train path/to/scene
 //! cargo run --release --example step_phases -- run
 //! ```
 //!
@@ -19,6 +19,7 @@ use raygrad::nerf::{Config, Instant, InstantConfig, Model, Query, Rays, SceneBox
 use raygrad::tensor::matmul::{Matrix, gemm};
 use raygrad::tensor::simd;
 use raygrad::{Adam, Optimizer, Params, Pool, Tape, Tensor};
+use raygrad_scenes::embedded;
 use serde_json::Value;
 use std::any::Any;
 use std::error::Error;
@@ -31,14 +32,17 @@ const RUNS: usize = 20;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let run = std::env::args().nth(1).ok_or("name a run: step_phases RUN")?;
-    // The phases are those of one thread. Reading photographs would start a pool of all of them.
+    // The phases are those of one thread. Reading images would start a pool of all of them.
     rayon::ThreadPoolBuilder::new().num_threads(1).build_global()?;
     let about: Value = serde_json::from_str(&std::fs::read_to_string(Path::new(&run).join("config.json"))?)?;
     let config: Config = serde_json::from_value(about["config"].clone())?;
     let extent: SceneBox = serde_json::from_value(about["scene_box"].clone())?;
-    let folder = about["scene"]["folder"].as_str().ok_or("the run's scene is not a folder")?;
     let model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
-    let data = load(folder, Split::Train, 1)?;
+    let data = match (about["scene"].as_str(), about["scene"]["folder"].as_str()) {
+        (Some("embedded"), _) => embedded(Split::Train, 200),
+        (_, Some(folder)) => load(folder, Split::Train, 1)?,
+        _ => return Err("the run's scene is neither `embedded` nor a folder".into()),
+    };
     measure(&model, &data)
 }
 
@@ -79,7 +83,7 @@ fn line_rate(bytes: usize) -> f64 {
     places.len() as f64 / seconds
 }
 
-/// A training batch of so many samples, more or less: rays and the colours that photographs show along them.
+/// A training batch of so many samples, more or less: rays and the colours that images show along them.
 fn batch(model: &Model<f32>, data: &Dataset, count: usize) -> (Rays<f32>, Vec<f32>) {
     let mut rng = StdRng::seed_from_u64(7);
     let (mut rays, mut target) = (Rays::new(), vec![]);

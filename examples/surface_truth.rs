@@ -6,8 +6,8 @@
 //! python benches/peers/surface.py truth mesh.ply
 //! ```
 //!
-//! Into the folder `truth` go `seen.ply`, points that the photographs' directions show, and `all.ply`, points that are seen from
-//! all sides, each with the true normal; and `density.npy`, the density at the nodes of a lattice, x slowest, as pictures have
+//! Into the folder `truth` go `seen.ply`, points that cameras see, and `all.ply`, points that are seen from
+//! all sides, each with the true normal; and `density.npy`, the density at the nodes of a lattice, x slowest, as images have
 //! it: 0 in cells that are not occupied. `density.json` says where its nodes are. For a run of another scene there is only the
 //! latter.
 
@@ -20,7 +20,7 @@ use serde_json::{Value, json};
 use std::error::Error;
 use std::path::Path;
 
-/// Cameras, and pixels on a side of the picture of each: two million points.
+/// Cameras, and pixels on a side of the image of each: two million points.
 const CAMERAS: usize = 150;
 const PIXELS: usize = 200;
 

@@ -1,12 +1,13 @@
-//! From photographs to new views: loads a scene, trains a NeRF on it, measures it on views that it has not seen, and
-//! writes a picture of one of them.
+//! From images to new views: loads a scene, trains a NeRF on it, measures it on views that it has not seen, and
+//! writes an image of one of them.
 //!
 //! ```text
-//! cargo run --release --example train_nerf [seconds] [folder for pictures]
+//! cargo run --release --example train_nerf [seconds] [folder for images]
 //! ```
 //!
-//! Trains for 60 seconds unless told otherwise. The scene is the embedded bulldozer; `dataset::load(folder, split, 2)`
-//! in its place reads a NeRF-synthetic scene at half its size.
+//! Trains for 60 seconds unless told otherwise. The scene is the embedded bulldozer; `dataset::load(folder, split, 2)?`
+//! in its place reads a capture at half its size. `Config::for_budget`, `with_scene_type`, `with_images` and
+//! `with_transparency` fit a preset to a budget and a capture, as `raygrad train` does.
 
 use raygrad::nerf::dataset::Split;
 use raygrad::nerf::imaging::colormap::{depth_map, error_map};
@@ -22,11 +23,11 @@ fn main() -> Result<()> {
     let mut args = std::env::args().skip(1);
     let seconds = args.next().map_or(60.0, |text| text.parse().expect("the first argument is a number of seconds"));
     let folder = PathBuf::from(args.next().unwrap_or("target/examples-out".into()));
-    std::fs::create_dir_all(&folder).expect("the folder for pictures can be made");
+    std::fs::create_dir_all(&folder).expect("the folder for images can be made");
 
     // Photographs with their cameras.
     let [train, test] = [Split::Train, Split::Test].map(|split| embedded(split, 100));
-    println!("{} photographs to train on, {} to test", train.frames.len(), test.frames.len());
+    println!("{} images to train on, {} to test", train.frames.len(), test.frames.len());
     let (near, far) = (test.near, test.far);
 
     // A model and its optimizer. Every number of the preset can be changed before this.

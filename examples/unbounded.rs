@@ -7,7 +7,7 @@
 //! The bulldozer in its landscape (exact out to a thousand units) is trained as if it ended at the box of the bulldozer and
 //! the cameras; contracted, with samples that proposals place (Barron et al. 2022, "Mip-NeRF 360"); and contracted, with
 //! steps that grow through cascades of an occupancy grid (Mueller et al. 2022, "Instant NGP"), which is what `raygrad
-//! train` does. From a window, where all photographs look the same way, what they see can be the cube instead of all of space:
+//! train` does. From a window, where all images look the same way, what they see can be the cube instead of all of space:
 //! normalised device coordinates (Mildenhall et al. 2020, appendix C), with the same steps. Of the views that it has not seen, near is what lies in the box.
 
 use raygrad::nerf::dataset::{Dataset, SceneType, Split, evenly_spaced};

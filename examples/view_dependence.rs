@@ -2,7 +2,7 @@
 //! without the viewing direction. Then points of the surface are held still and looked at from everywhere above.
 //!
 //! ```text
-//! cargo run --release --example view_dependence [folder for the picture]
+//! cargo run --release --example view_dependence [folder for the image]
 //! ```
 //!
 //! Takes about half a minute on two cores. Each disc is the hemisphere of directions from which one point is seen, from
@@ -21,7 +21,7 @@ use std::path::PathBuf;
 
 const STEPS: usize = 6000;
 const BATCH: usize = 1024;
-/// Width of a disc in the picture, in pixels.
+/// Width of a disc in the image, in pixels.
 const SIZE: usize = 96;
 const HIDDEN: [f32; 3] = [0.8; 3];
 
@@ -116,7 +116,7 @@ fn traced(scene: &Scene, point: DVec3, viewer: DVec3) -> Option<[f32; 3]> {
 
 fn main() -> Result<()> {
     let folder = PathBuf::from(std::env::args().nth(1).unwrap_or("target/examples-out".into()));
-    std::fs::create_dir_all(&folder).expect("the folder for the picture can be made");
+    std::fs::create_dir_all(&folder).expect("the folder for the image can be made");
     let scene = Scene::bulldozer();
     let sights = sights(&scene);
     println!("{} sights of the surface", sights.len());
