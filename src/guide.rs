@@ -99,7 +99,7 @@
 //! ```
 //!
 //! An operation with a name is a [`Formula`](crate::Formula): a function that is generic over the number type. It can
-//! define its derivative too, if another form is more accurate or faster.
+//! define its derivative too, if another form is more accurate or faster. The feature `check` has its examination.
 //!
 //! ```
 //! use raygrad::check::{Cases, Check, Entry, check_op};

@@ -18,7 +18,7 @@
 //! * [`nn`]: parameters, layers, optimizers and their files.
 //!
 //! The feature `nerf` (on by default) adds one more:
-//! * [`nerf`](https://docs.rs/raygrad-nerf): cameras, datasets, encodings, fields, sampling, rendering, training.
+//! * `nerf`: cameras, datasets, encodings, fields, sampling, rendering, training.
 
 pub mod guide;
 
