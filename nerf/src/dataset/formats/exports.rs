@@ -8,11 +8,11 @@ use std::path::{Path, PathBuf};
 type Export = (&'static str, &'static str);
 
 /// Files of other programs that are no capture yet: a file or folder, the program, and the remedy.
-pub(super) const EXPORTS: [(&str, &str, &str); 23] = [
+pub(super) const EXPORTS: [(&str, &str, &str); 31] = [
     ("keyframes", "a raw export of Polycam", "convert it with nerfstudio's `ns-process-data polycam`"),
     ("rgbd", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
     ("EXR_RGBD", "an export of Record3D", "convert it with nerfstudio's `ns-process-data record3d`"),
-    ("intrinsics.txt", "a dataset of NSVF", "write its poses as transforms_train.json"),
+    ("intrinsics.txt", "a dataset such as NSVF's", "write its poses as transforms_train.json"),
     ("cameras_sphere.npz", "a dataset of DTU", "write its matrices as transforms.json"),
     ("cameras.npz", "a dataset of IDR or VolSDF", "write its matrices as transforms.json"),
     ("meta_data.json", "a dataset of SDFStudio", "write its frames as transforms.json"),
@@ -29,6 +29,14 @@ pub(super) const EXPORTS: [(&str, &str, &str); 23] = [
     ("train/pose", "a dataset of NeRF++", "write its matrices as transforms.json"),
     ("results/frame000000.jpg", "a sequence of Replica", "write its matrices as transforms.json"),
     ("rgb.txt", "a sequence of TUM RGB-D", "write its poses as transforms.json"),
+    ("frame_00000.json", "an export of 3D Scanner App", "write its `cameraPoseARFrame` as transforms.json"),
+    ("lowres_wide.traj", "a scan of ARKitScenes", "write its trajectory as transforms.json"),
+    ("frame_annotations.jgz", "a category of CO3D", "write the viewpoints of a sequence as transforms.json"),
+    ("mav0", "a sequence of EuRoC", "write its poses as transforms.json"),
+    ("image_2/000000.png", "a sequence of KITTI", "write its poses as transforms.json"),
+    ("coordinates.pt", "a dataset of Mega-NeRF, such as Mill 19", "write its metadata as transforms.json"),
+    ("camera-paths", "a dataset of Nerfies", "write its cameras as transforms.json"),
+    ("frame-000000.pose.txt", "a sequence of 7-Scenes", "write its poses as transforms.json"),
     ("cfg_args", "an output of 3D Gaussian Splatting", "name the capture that its `source_path` names"),
     ("dataparser_transforms.json", "a run of nerfstudio", "name the capture that it was trained on"),
     ("database.db", "a COLMAP project without a model", "run COLMAP's mapper, or `raygrad prepare` on the images"),
@@ -53,18 +61,25 @@ const MVSNET: Export = ("a dataset of MVSNet", "write its cameras as transforms.
 const UNUSUAL: Export = ("of the form of transforms.json", "name that file");
 
 /// Ends of the names of files of other programs.
-const ENDINGS: [(&str, Export); 7] = [
+const ENDINGS: [(&str, Export); 9] = [
     (".psx", METASHAPE),
     (".nvm", ("a reconstruction of VisualSFM", "write its cameras as transforms.json")),
     (".sfm", MESHROOM),
     ("bundle.rd.out", ("a reconstruction of Bundler", "write its cameras as transforms.json")),
     ("_cam.txt", MVSNET),
     ("shots.geojson", ("a project of OpenDroneMap", "convert it with nerfstudio's `ns-process-data odm`")),
+    ("_colmap_sfm.log", ("a trajectory of Tanks and Temples", "write its matrices as transforms.json")),
+    ("calibrated_camera_parameters.txt", ("a project of Pix4D", "write its cameras as transforms.json")),
     (".sens", ("a scene of ScanNet", "write its poses as transforms.json")),
 ];
 
 /// Words that the files with an ending have, all of them; several programs use these endings.
-const CONTENTS: [(&str, &[&str], Export); 5] = [
+const CONTENTS: [(&str, &[&str], Export); 6] = [
+    (
+        "xml",
+        &["<BlocksExchange"],
+        ("an export in BlocksExchange, as of ContextCapture or DJI Terra", "export for COLMAP"),
+    ),
     ("xml", &["<document", "<chunk"], METASHAPE),
     ("csv", &["name,x,y,alt"], REALITY),
     ("json", &["\"img_name\"", "\"rotation\""], SPLATS),

@@ -29,7 +29,10 @@ fn exports_under_other_names_are_known_by_their_ending_or_content() {
     for (name, content, what) in [
         ("project.psx", "", "Agisoft Metashape"),
         ("my project.xml", chunk, "Agisoft Metashape"),
+        ("blocks.xml", "<?xml version=\"1.0\"?>\n<BlocksExchange version=\"3.2\">", "BlocksExchange"),
         ("scene.nvm", "NVM_V3", "VisualSFM"),
+        ("Barn_COLMAP_SfM.log", "0 0 0", "Tanks and Temples"),
+        ("walk_calibrated_camera_parameters.txt", "fileName", "Pix4D"),
         ("sfm.sfm", "{}", "Meshroom"),
         ("views.json", r#"{"version": ["1"], "views": [], "intrinsics": []}"#, "Meshroom"),
         ("bundle/bundle.rd.out", "", "Bundler"),
