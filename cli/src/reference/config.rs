@@ -401,7 +401,8 @@ fn page() -> String {
         "Defaults are those of the presets; one value means that all presets have it. `raygrad train` adapts some to the \
          budget: the size of the hash grid, `color_depth`, `step`, `last_step` and `samples`. For unbounded scenes it also \
          changes `cascades`, `resolution`, `cone` and `view_step`, and adds a distortion loss. Transparent images of a bounded \
-         scene change `early_stop_eps`.",
+         scene change `early_stop_eps`, opaque ones `background`. The number of cores changes `tiles`, and 16 images or \
+         fewer change `coarse` and `check_at`.",
         "This page is generated from the program. `UPDATE_SNAPSHOTS=1 cargo test -p raygrad-cli --bin raygrad reference` \
          writes it.",
     ] {

@@ -254,11 +254,16 @@ fn near(keys: [Keyframe; 4], u: f64) -> Keyframe {
     let v = 1.0 - u;
     let middle = |u: f64| (3.0 * u * u * u - 6.0 * u * u + 4.0) / 6.0;
     let weights = [v * v * v / 6.0, middle(u), middle(v), u * u * u / 6.0];
-    let middle = DQuat::from_mat3(&keys[1].pose.matrix3);
+    // A rotation has two quaternions. Neighbours choose the nearer ones, so that all legs of a path choose alike.
+    let mut turns = keys.map(|key| DQuat::from_mat3(&key.pose.matrix3));
+    for i in 1..4 {
+        if turns[i].dot(turns[i - 1]) < 0.0 {
+            turns[i] = -turns[i];
+        }
+    }
     let (mut rotation, mut translation, mut angle_y) = (DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0), DVec3::ZERO, 0.0);
-    for (key, weight) in keys.iter().zip(weights) {
-        let other = DQuat::from_mat3(&key.pose.matrix3);
-        rotation += other * (weight * if other.dot(middle) < 0.0 { -1.0 } else { 1.0 });
+    for ((key, turn), weight) in keys.iter().zip(turns).zip(weights) {
+        rotation += turn * weight;
         translation += weight * key.pose.translation;
         angle_y += weight * key.angle_y;
     }

@@ -94,16 +94,14 @@ impl Camera {
         self.pixel_of(point).is_some_and(|[x, y]| (0.0..width).contains(&x) && (0.0..height).contains(&y))
     }
 
-    /// Directions of rays along the border of the image that the lens sees; if it sees none, of the whole border.
+    /// Directions of rays along the border of the image; where the lens sees none, the outermost direction towards it.
     pub(crate) fn border(&self) -> impl Iterator<Item = DVec3> {
         /// Places along each side.
         const PLACES: usize = 16;
         let [width, height] = [self.width as f64, self.height as f64];
         let shares = (0..=PLACES).map(|i| i as f64 / PLACES as f64);
         let places = shares.flat_map(|share| [[share, 0.0], [share, 1.0], [0.0, share], [1.0, share]]);
-        let places: Vec<[f64; 2]> = places.map(|[x, y]| [x * width, y * height]).collect();
-        let dark = !places.iter().any(|[x, y]| self.sees(*x, *y));
-        places.into_iter().filter(move |[x, y]| dark || self.sees(*x, *y)).map(|[x, y]| self.ray(x, y).direction)
+        places.map(move |[x, y]| self.ray(x * width, y * height).direction)
     }
 
     fn plane(&self, x: f64, y: f64) -> [f64; 2] {

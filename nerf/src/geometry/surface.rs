@@ -30,8 +30,8 @@ pub struct SurfaceConfig {
     /// The box of the surface; `None` takes the scene box. There is no surface where the model has no densities: beyond
     /// the scene box of a bounded scene, and beyond the [reach](Model::reach) of others.
     pub region: Option<OrientedBox>,
-    /// Lattice cells along the longest side of the box, 1 to 4096. `None` takes two per cell of the model's occupancy
-    /// grid, or 256 without a grid.
+    /// Lattice cells along the longest side of the box, 1 to 4096. `None` takes two per cell that the model's
+    /// occupancy grid has along the scene box, or 256 without a grid; for a region of another size, set it.
     pub resolution: Option<usize>,
     /// Iso-value: the density on the surface, in 1 / scene unit, above 0. `None` estimates it from `cameras`.
     pub iso_value: Option<f64>,

@@ -96,6 +96,7 @@ impl<T: Scalar> Model<T> {
     #[inline(never)]
     pub fn with_cameras(config: Config, extent: SceneBox, cameras: &[Camera], seed: u64) -> Result<Self> {
         config.check()?;
+        extent.check()?;
         let space = space(&config, &extent);
         space.check()?;
         let (mut params, frames) = (Params::new(), extent.frames);

@@ -2,6 +2,7 @@
 
 use crate::camera::Ndc;
 use crate::dataset::SceneTransform;
+use crate::error::{Error, Result};
 use crate::space::cube::Space;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -36,7 +37,7 @@ fn one() -> f64 {
 }
 
 impl SceneBox {
-    /// Creates a scene box with unit 1, without images, transform or NDC.
+    /// Creates a scene box with a third of its longest side as unit, without images, transform or NDC.
     pub fn new(bounds: [DVec3; 2], span: [f64; 2]) -> Self {
         SceneBox {
             bounds,
@@ -46,6 +47,19 @@ impl SceneBox {
             transform: SceneTransform::default(),
             ndc: None,
         }
+    }
+
+    /// Checks that near and far are in range. [`Space::check`] checks the rest.
+    ///
+    /// # Errors
+    /// If they are not.
+    pub fn check(&self) -> Result<()> {
+        let [near, far] = self.near_far;
+        if near >= 0.0 && near < far && far.is_finite() {
+            return Ok(());
+        }
+        let what = format!("is {near} to {far}; near must be at least 0 and less than far");
+        Err(Error::setting("scene_box.near_far", what))
     }
 
     /// Returns whether a point (scene units) is inside the box, faces included.

@@ -79,8 +79,14 @@ impl<T: Scalar> Model<T> {
             if let Some(gain) = &gain {
                 for (seen, pixel) in pixels.iter_mut().zip(first..) {
                     let gains = gain.at(camera.off_axis(camera.place_of(pixel)));
-                    let color = seen.color.iter_mut().zip(gains);
-                    color.for_each(|(color, gain)| *color = (*color * gain).min(1.0));
+                    // White is the brightest colour behind this opacity. NaN stays.
+                    let most = 1.0 - seen.transmittance;
+                    for (color, gain) in seen.color.iter_mut().zip(gains) {
+                        *color *= gain;
+                        if *color > most {
+                            *color = most;
+                        }
+                    }
                 }
             }
             keep(&pixels, out);

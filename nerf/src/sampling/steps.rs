@@ -16,7 +16,7 @@ use raygrad_autograd::{Pool, Scalar, Segments};
 /// far.
 ///
 /// # Panics
-/// If there is not one weight per sample.
+/// If there is not one weight per sample, or rays have no samples or different numbers of them.
 pub fn importance_sampling<T: Scalar>(
     rays: &Rays<T>,
     coarse: &Samples<T>,
@@ -28,6 +28,8 @@ pub fn importance_sampling<T: Scalar>(
 ) -> Samples<T> {
     assert_eq!(weights.len(), coarse.len(), "weights must have one entry per coarse sample");
     let bins = if rays.is_empty() { 0 } else { coarse.len() / rays.len() };
+    let is_even = coarse.segments.ranges().all(|own| own.len() == bins && bins > 0);
+    assert!(is_even, "each ray must have the same number of coarse samples, and at least one");
     let segments = Segments::uniform(rays.len(), bins + count);
     let (mut t, mut delta) = (pool.tensor(&[segments.rows()]), pool.tensor(&[segments.rows()]));
     let edges = even_edges(bins);
@@ -140,6 +142,8 @@ mod tests {
     use proptest::prelude::*;
     use rand::SeedableRng;
     use rand_pcg::Pcg64Mcg;
+    use raygrad_autograd::Tensor;
+    use std::panic::AssertUnwindSafe;
 
     fn rays(count: usize) -> Rays<f64> {
         let mut rays = Rays::new();
@@ -185,6 +189,21 @@ mod tests {
         for bad in [f32::NAN, -1.0, f32::INFINITY] {
             let error = invert_cdf(&even_edges(2), &[1.0, bad], 0.1, &u, &mut out).unwrap_err().to_string();
             assert!(error.starts_with("`weights[1]`: is "), "{error}");
+        }
+    }
+
+    #[test]
+    fn importance_sampling_needs_as_many_samples_on_each_ray() {
+        let (rays, pool) = (rays(2), Pool::new());
+        for ends in [[0, 0, 0], [0, 1, 4]] {
+            let distances = Tensor::from_fn(&[ends[2] as usize], |i| 2.5 + i as f64);
+            let lengths = Tensor::ones(distances.shape());
+            let coarse = Samples::new(&rays, Segments::new(ends), distances, lengths, &pool);
+            let weights = vec![1.0; coarse.len()];
+            let draw = || importance_sampling(&rays, &coarse, &weights, 2, 0.0, &mut Jitter::Middle, &pool);
+            let panic = std::panic::catch_unwind(AssertUnwindSafe(draw)).err().unwrap();
+            let message = panic.downcast_ref::<&str>().unwrap();
+            assert!(message.contains("the same number of coarse samples"), "{message}");
         }
     }
 

@@ -62,7 +62,7 @@ impl Space {
     /// Maps positions `[samples, 3]` from scene units to the unit cube.
     ///
     /// For a bounded scene the box's lower corner maps to the origin, and its longest side has length 1; points outside
-    /// of the box map outside of the cube. In [NDC](Ndc) the last axis is `1 - near / depth`, from the near plane to
+    /// of a cubic box map outside of the cube. In [NDC](Ndc) the last axis is `1 - near / depth`, from the near plane to
     /// infinity.
     #[track_caller]
     pub fn cube<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {

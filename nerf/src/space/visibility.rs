@@ -86,4 +86,18 @@ mod tests {
         carve_unseen(&mut both, &data);
         assert!(both.occupied_share() > share && count(&both) == count(&grid));
     }
+
+    /// The outermost directions lie between the places of the border that the lens sees.
+    #[test]
+    fn cones_reach_the_fold_of_a_lens() {
+        let pose = Camera::look_at(DVec3::new(0.0, 0.0, 3.0), DVec3::ZERO, DVec3::Y);
+        let mut camera = Camera::from_angle(192, 108, std::f64::consts::FRAC_PI_2, pose);
+        camera.lens = crate::camera::lens::Lens::Brown { k: [-0.3, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+        let cone = Cone::new(&camera);
+        let seen = (0..192 * 108)
+            .map(|pixel| camera.place_of(pixel))
+            .filter(|[x, y]| camera.sees(*x as f64 + 0.5, *y as f64 + 0.5));
+        let most = seen.map(|[x, y]| camera.pixel_ray(x, y).direction.angle_between(cone.axis)).fold(0.0, f64::max);
+        assert!(most > 0.78 && cone.half_angle >= most, "{most} {}", cone.half_angle);
+    }
 }

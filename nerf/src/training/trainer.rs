@@ -27,6 +27,9 @@ use std::time::{Duration, Instant};
 const FEWEST_RAYS: usize = 256;
 /// Steps between releases of unused memory: the number of samples changes during training.
 const TRIM_EVERY: u64 = 256;
+/// The most time that counts for a step: so many times the mean of the steps before, and no less than this.
+const STOPPED_SHARE: u32 = 20;
+const STOPPED: Duration = Duration::from_secs(10);
 /// The fewest steps of a model, and rays of an image, after which poses are checked: they begin at 0 and need time to
 /// move.
 const CHECKED_STEPS: u64 = 100;
@@ -56,6 +59,8 @@ pub struct Trainer {
     /// The lr scale.
     pub(super) lr_scale: f64,
     pub(super) done: StepStats,
+    /// Whether only cameras are fitted, to a model that stays as it is.
+    pub(super) is_fixed: bool,
 }
 
 /// Tiles that read the table gradients of other processes.
@@ -166,6 +171,7 @@ impl Trainer {
             collapses: 0,
             lr_scale: 1.0,
             done: StepStats { restarts, ..StepStats::default() },
+            is_fixed: false,
         };
         trainer.prepare();
         Ok(trainer)
@@ -238,7 +244,8 @@ impl Trainer {
         self.across.iter_mut().for_each(|across| across.stops = false);
         while self.agrees_to_go_on(budget) {
             let fraction = match budget {
-                Budget::Steps(steps) => self.done.step as f64 / steps.max(1) as f64,
+                Budget::Steps(0) => 1.0,
+                Budget::Steps(steps) => self.done.step as f64 / steps as f64,
                 Budget::Time(time) => self.elapsed.as_secs_f64() / time.as_secs_f64().max(1e-9),
             };
             if fraction >= 1.0 {
@@ -270,6 +277,15 @@ impl Trainer {
         self.elapsed += (self.clock)().saturating_sub(start);
     }
 
+    /// The part of a step's time that counts as training: the process may have been stopped meanwhile, by a terminal or a
+    /// batch system.
+    fn counted(&self, time: Duration) -> Duration {
+        match u32::try_from(self.done.step) {
+            Ok(steps @ 1..) => time.min((STOPPED_SHARE * self.elapsed / steps).max(STOPPED)),
+            _ => time,
+        }
+    }
+
     /// Performs one training step; `fraction` of the run (0 to 1) sets the schedules. If the step is
     /// [shared](Self::share) and a process is lost, no gradient step is made, and the statistics stay as they are.
     pub fn step(&mut self, fraction: f64) -> StepStats {
@@ -283,7 +299,9 @@ impl Trainer {
             self.model.set_detail(if self.done.given_poses_are_right() { 1.0 } else { detail });
         }
         // After a restart, steps of the new model count.
-        self.update_sampler(&Progress { step: self.groups.steps() + 1, train_frac: fraction, seed: self.seed() });
+        if !self.is_fixed {
+            self.update_sampler(&Progress { step: self.groups.steps() + 1, train_frac: fraction, seed: self.seed() });
+        }
         if self.exchange_error().is_some() {
             return self.done;
         }
@@ -311,7 +329,7 @@ impl Trainer {
         }
         let work = step.results.into_iter().fold(Work::default(), Work::add);
         let values = 3.0 * self.batch as f64;
-        self.elapsed += (self.clock)().saturating_sub(start);
+        self.elapsed += self.counted((self.clock)().saturating_sub(start));
         self.done = StepStats {
             step: number,
             train_seconds: self.elapsed.as_secs_f64(),
@@ -337,7 +355,7 @@ impl Trainer {
             pose_motion: self.done.pose_motion,
         };
         self.adapt_batch(&work);
-        if startup::has_collapsed(self.groups.steps(), self.done.opacity, self.collapses) {
+        if !self.is_fixed && startup::has_collapsed(self.groups.steps(), self.done.opacity, self.collapses) {
             self.restart();
         }
         self.done

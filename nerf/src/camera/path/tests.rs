@@ -167,6 +167,22 @@ fn near_curve_is_a_cubic_b_spline() {
     assert!(apart(&around.at(0.5), &turned(180.0)) < 1e-12);
 }
 
+/// Cameras two apart look in opposite directions, so that their quaternions have no common half space.
+#[test]
+fn near_curve_of_few_keyframes_around_an_object_does_not_jump() {
+    for count in [3, 4, 5] {
+        let key = |i: usize| {
+            let angle = i as f64 / count as f64 * TAU;
+            let eye = DVec3::new(3.0 * angle.cos(), 3.0 * angle.sin(), 0.3);
+            Keyframe { pose: Camera::look_at(eye, DVec3::ZERO, DVec3::Z), angle_y: 0.8 }
+        };
+        let path = CameraPath::timed((0..count).map(key).collect(), vec![1.0; count], true, Curve::Near);
+        let frames = path.frames(3600);
+        let largest = frames.windows(2).map(|pair| apart(&pair[0], &pair[1])).fold(0.0, f64::max);
+        assert!(largest < 0.02, "{count}: {largest}");
+    }
+}
+
 #[test]
 fn paths_of_few_or_equal_keyframes_are_finite() {
     let [a, b] = [keys()[0], keys()[1]];

@@ -41,7 +41,8 @@ const SAME: f64 = 1e-9;
 /// - `lens` `[cameras, 4]`: added to the distortion coefficients `k1, k2, p1, p2` (fisheye: `k1, k2`; FOV model:
 ///   omega). A pinhole becomes a [`Lens::Brown`].
 ///
-/// Visual hull carving is off while cameras are refined.
+/// Visual hull carving is off while cameras are refined, unless the [check](CameraOptimizerConfig::check_at) finds that the
+/// given poses are right.
 ///
 /// Images fix only the cameras relative to each other: scene and cameras can turn, move and grow together.
 /// [`transform`](Self::transform) returns that common similarity.

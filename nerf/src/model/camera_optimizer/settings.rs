@@ -28,9 +28,9 @@ pub struct CameraOptimizerConfig {
     /// Fine detail too early pulls a pose to the nearest repetition of a pattern. 0 shows all detail from the
     /// start. Range: 0 to 1.
     pub coarse: f64,
-    /// Share of the run after which the trainer checks the poses. If they moved the images by less than .45 degrees,
-    /// the given poses are right: they are restored, all detail is enabled, and their learning rate falls to a
-    /// fiftieth. 0 omits the check. Range: 0 to 1.
+    /// Share of the run after which the trainer checks the poses. The given poses are right if they moved the median
+    /// image by less than .4 degrees and each by less than .85. Then they are restored, all detail is enabled, and
+    /// their learning rate falls to a fiftieth. 0 omits the check. Range: 0 to 1.
     pub check_at: f64,
 }
 

@@ -165,7 +165,7 @@ pub struct Threshold {
     /// Whether the mean density of all cells is the threshold instead where it is smaller: the usual rule in training,
     /// which keeps a field that is still faint everywhere.
     pub or_mean: bool,
-    /// Whether the 26 neighbours of an occupied cell are occupied too.
+    /// Whether the 26 neighbours of an occupied cell are occupied too, in its cascade and in those around it.
     pub dilate: bool,
 }
 

@@ -205,9 +205,9 @@ impl OccupancyGrid {
     /// cell that touches an occupied one, until there are no more. The result equals eight samples in every cell,
     /// except for groups of touching cells that all miss in their first sample. A box of one cell's size with more than
     /// `min_sigma` everywhere is never missed. Of a group that is found, each cell with such a box of half that edge is
-    /// occupied.
+    /// occupied. Cells touch within a cascade; a cell also touches those of larger cascades, but no smaller ones.
     ///
-    /// With `dilate`, the 26 neighbours of each occupied cell are occupied too.
+    /// With `dilate`, the 26 neighbours of each occupied cell are occupied too, in its cascade and in those around it.
     pub fn rebuild(&mut self, min_sigma: f32, dilate: bool, density: &DensityFn<'_>) -> u64 {
         let all = Places::middles(REBUILD);
         let one = Places { corners: all.corners[..1].to_vec(), ..all };

@@ -20,6 +20,7 @@ use crate::{FieldConfig, Preset};
 use glam::DVec3;
 use raygrad_autograd::Tensor;
 use raygrad_nn::Schedule;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 #[test]
 fn cameras_without_view_of_the_box_are_an_error() {
@@ -581,4 +582,51 @@ fn optimizer_settings_are_checked() {
     config.table_adam.beta2 = 2.0;
     assert!(message(&config).contains("`table_adam.beta2`: is 2.0"));
     assert!(Trainer::new(config, Arc::new(ball(Split::Train, 12))).is_err());
+}
+
+/// A process that was stopped for an hour has not trained for an hour.
+#[test]
+fn time_while_stopped_does_not_count() {
+    let data = Arc::new(ball(Split::Train, 8));
+    let extent = SceneBox::new(data.bounds, [data.near, data.far]);
+    let clock = Arc::new(AtomicU64::new(0));
+    let now = clock.clone();
+    // Each reading of the clock takes a second, and in the fifth step an hour.
+    let now = move || {
+        let readings = now.fetch_add(1, Relaxed);
+        Duration::from_secs(readings + if readings < 11 { 0 } else { 3600 })
+    };
+    let mut trainer = Trainer::with_clock(tiny_table(), data, extent, now).unwrap();
+    let seconds: Vec<f64> = (0..6).map(|_| trainer.step(0.0).train_seconds).collect();
+    // The first second is that of the preparation; of the hour, twenty times the mean of 5/4 s count.
+    assert_eq!(seconds, [2.0, 3.0, 4.0, 5.0, 30.0, 31.0]);
+}
+
+#[test]
+fn a_budget_of_no_steps_trains_none() {
+    let mut trainer = Trainer::new(tiny_table(), Arc::new(ball(Split::Train, 8))).unwrap();
+    trainer.run(Budget::Steps(0), |_| ControlFlow::Continue(()));
+    assert_eq!(trainer.stats().step, 0);
+}
+
+#[test]
+fn near_and_far_are_checked() {
+    for near_far in [[0.1, f64::INFINITY], [5.0, 1.0], [f64::NAN, 1.0], [-1.0, 1.0]] {
+        let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], near_far);
+        let error = Model::<f32>::new(tiny_table(), extent, 0).err().unwrap().to_string();
+        assert!(error.starts_with("`scene_box.near_far`"), "{error}");
+    }
+}
+
+/// However bright the exposure, renders are at most white, and the background shines through.
+#[test]
+fn renders_with_an_exposure_are_at_most_white() {
+    let data = Arc::new(ball(Split::Train, 8));
+    let mut model = Trainer::new(tiny_table().with_refined(&[RefinedParam::Exposure]), data.clone()).unwrap().model;
+    let exposure = model.params.find("exposure").unwrap();
+    model.params.get_mut(exposure).as_mut_slice().fill(3.0);
+    let colors = |model: &Model<f32>| model.render(&data.frames[0].camera, [1.0; 3]).color.data;
+    let bright = colors(&model);
+    assert!(bright.iter().all(|color| *color <= 1.0 + 1e-6), "{bright:?}");
+    assert!(bright.iter().filter(|color| **color > 1.0 - 1e-6).count() > bright.len() / 2);
 }

@@ -105,9 +105,9 @@ fn rank_0_counts_the_time_and_any_rank_stops_all() {
     let timed = |rank: usize| {
         let data = Arc::new(ball(Split::Train, 12));
         let extent = SceneBox::new(data.bounds, [data.near, data.far]);
-        let seconds = std::sync::atomic::AtomicU64::new(0);
+        let seconds = AtomicU64::new(0);
         let clock = move || match rank {
-            0 => Duration::from_secs(seconds.fetch_add(1, std::sync::atomic::Ordering::Relaxed)),
+            0 => Duration::from_secs(seconds.fetch_add(1, Relaxed)),
             _ => Duration::ZERO,
         };
         Trainer::with_clock(tiny_table(), data, extent, clock).unwrap()
