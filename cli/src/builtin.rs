@@ -24,6 +24,9 @@ pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Re
     let (usual, format): ([usize; 2], _) = match scene {
         Scene::Embedded => ([EMBEDDED_SIZE; 2], Format::Blender),
         Scene::Landscape => (LANDSCAPE_SIZE, Format::Transforms),
+        Scene::Folder(_) if width.is_some() => {
+            return Err(Error::setting("size", "is for built-in scenes, and the images of a folder keep their size"));
+        }
         Scene::Folder(folder) => return Capture::read(folder),
     };
     let width = width.unwrap_or(usual[0]);

@@ -124,7 +124,7 @@ fn arc(mut angles: Vec<f64>) -> (f64, f64) {
     let next = angles.iter().skip(1).copied().chain(angles.first().map(|first| first + TAU));
     let gaps = angles.iter().zip(next).map(|(from, to)| [*from, to]);
     match gaps.max_by(|a, b| (a[1] - a[0]).total_cmp(&(b[1] - b[0]))) {
-        Some([from, to]) if to - from > GAP => (0.5 * (from + to) + PI, PI - 0.5 * (to - from)),
+        Some([from, to]) if to - from > GAP => (0.5 * (from + to) + PI, (PI - 0.5 * (to - from)).max(0.0)),
         _ => (0.0, PI),
     }
 }

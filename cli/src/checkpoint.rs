@@ -95,8 +95,9 @@ fn surplus(found: &[(u64, PathBuf)], step: Option<u64>) -> Option<PathBuf> {
     }
 }
 
-/// Loads the latest intact checkpoint into a trainer and warns of damaged ones. Fails if all are damaged, or if none
-/// exists although the run has taken steps. A trainer of a run without steps keeps its initial state.
+/// Loads the latest intact checkpoint into a trainer and warns of damaged ones. Fails if all are damaged, if it does not
+/// fit the trainer, or if none exists although the run has taken steps. A trainer of a run without steps keeps its
+/// initial state.
 pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     let checkpoints = all(&folder(run))?;
     let none = checkpoints.is_empty();
@@ -114,10 +115,17 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
         let unread =
             |e| Error::file(&path, format!("cannot be read: {e}; delete it to resume from the checkpoint before it"));
         let bytes = fs::read(&path).map_err(unread)?;
-        let loaded =
-            parse(&path, bytes).and_then(|state| trainer.load_state(&state).map_err(|e| Error::file(&path, e)));
-        let Err(error) = loaded else { return Ok(()) };
-        complain(&format!("warning: {error}"));
+        match parse(&path, bytes) {
+            Ok(state) => {
+                let changed = |error| {
+                    let what =
+                        "The checkpoint is intact. If config.json was changed, restore its `config` and `scene_box`";
+                    Error::file(&path, format!("{error}. {what}"))
+                };
+                return trainer.load_state(&state).map_err(changed);
+            }
+            Err(error) => complain(&format!("warning: {error}")),
+        }
     }
     match none {
         false => {

@@ -6,8 +6,8 @@ mod page;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
+use raygrad::nerf::dataset::Capture;
 use raygrad::nerf::dataset::formats::transforms;
-use raygrad::nerf::dataset::{Capture, Split};
 use raygrad::nerf::geometry::files::Format;
 use raygrad::nerf::{Error, Model, Result, write_atomic};
 use raygrad::nn::TEMPORARY_PREFIX;
@@ -17,7 +17,7 @@ use super::builtin;
 use super::interrupt::{self, Work};
 use super::output::{parent, print};
 use super::overwrite::Job;
-use super::photographs::{check_trained, present};
+use super::photographs::trained;
 use super::prepare::convert::{Conversion, Target, relative};
 use super::run::{Run, check_output};
 use super::scene::Scene;
@@ -137,10 +137,8 @@ fn refine(capture: &mut Capture, model: &Model<f32>, run: &Run) -> Result<usize>
     let Some(refine) = &model.camera_optimizer else { return Ok(0) };
     let drift = refine.transform(&model.params).unwrap_or_default();
     let transform = model.scene_box.transform;
-    let views = present(capture, Split::Train)?;
-    check_trained(run, capture, &views, model.scene_box.frames)?;
     let trained: HashMap<String, usize> =
-        views.iter().enumerate().map(|(number, view)| (view.field.clone(), number)).collect();
+        trained(run, capture)?.iter().enumerate().map(|(number, view)| (view.field.clone(), number)).collect();
     for view in &mut capture.views {
         let given = transform.camera(&view.camera);
         let found = match trained.get(&view.field) {

@@ -50,7 +50,7 @@ use raygrad::nerf::{Error, Result};
 use raygrad::tensor::simd;
 
 use interrupt::{Stop, Work};
-use output::{complain_of, print};
+use output::{complain_of, print, quoted};
 use train::Trained;
 
 /// Help text on exit codes.
@@ -172,9 +172,9 @@ fn end_first_run(trained: &Trained, render: impl FnOnce(&Path) -> Work<()>) -> W
 
 /// Prints the next commands for a run.
 fn suggest(folder: &Path) -> Result<()> {
-    let folder = folder.display();
+    let [folder, orbit] = [folder, &folder.join("orbit.gif")].map(quoted);
     print(&format!(
-        "next     raygrad render {folder} --out {folder}/orbit.gif   to render an orbit video\n         raygrad view \
+        "next     raygrad render {folder} --out {orbit}   to render an orbit video\n         raygrad view \
          {folder} --open   to open the viewer\n         raygrad eval {folder}   to measure it on held-out images\n"
     ))
 }

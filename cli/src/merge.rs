@@ -6,7 +6,7 @@ use std::time::Duration;
 use raygrad::nerf::Error;
 
 use super::interrupt::{self, Work};
-use super::output::{entries, print};
+use super::output::{entries, print, quoted};
 use super::prepare::convert;
 use super::shard::{self, Complete, Progress, Shard};
 use super::{eval, ranks, render};
@@ -73,7 +73,7 @@ fn merge_ranks(at: &Path) -> Work<()> {
     }
     let what = format!(
         "does not show the results of all ranks: use a file system that all share, or run `raygrad merge {}` later",
-        at.display()
+        quoted(at)
     );
     Err(Error::file(at, what).into())
 }

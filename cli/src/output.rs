@@ -49,6 +49,17 @@ pub fn listed(names: &[String], most: usize) -> String {
     named.join(", ") + &more
 }
 
+/// A path as a shell takes it, for commands in messages: in quotes if it has other characters than those of plain names.
+pub fn quoted(path: &Path) -> String {
+    let path = path.display().to_string();
+    let is_plain = |c: char| c.is_alphanumeric() || "._-/\\:~+@,".contains(c);
+    match path.chars().all(is_plain) {
+        true => path,
+        false if cfg!(windows) => format!("\"{path}\""),
+        false => format!("'{}'", path.replace('\'', r"'\''")),
+    }
+}
+
 /// Writes a line to standard error, on rank 0 alone. Ignores errors, unlike `eprintln`, which panics if standard error is closed.
 pub fn note(line: &str) {
     if !ranks::is_silent() {

@@ -1,5 +1,7 @@
 //! Cameras of a run's images, without the pixels.
 
+use std::collections::HashSet;
+
 use raygrad::nerf::dataset::{Capture, Split, View};
 use raygrad::nerf::{Camera, Error, Model, Result};
 
@@ -22,12 +24,9 @@ pub struct Photograph {
 /// Fails if the capture cannot be read, the split has no images, or the training images differ from those of the run.
 pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: Split) -> Result<Vec<Photograph>> {
     let capture = run.capture(scene)?;
-    let views = present(&capture, split)?;
+    let views = if split == Split::Train { trained(run, &capture)? } else { present(&capture, split)? };
     if views.is_empty() {
         return Err(Error::file(&capture.file, format!("has no {split} images")));
-    }
-    if split == Split::Train {
-        check_trained(run, &capture, &views, model.scene_box.frames)?;
     }
     let transform = model.scene_box.transform;
     let given: Vec<Camera> = views.iter().map(|view| transform.camera(&view.camera)).collect();
@@ -54,8 +53,22 @@ pub fn present(capture: &Capture, split: Split) -> Result<Vec<&View>> {
     Ok(capture.split(split)?.into_iter().filter(|view| is_made || view.image.is_some()).collect())
 }
 
-/// Fails if the training views differ from the `count` images that the run was trained on. A count of 0 is unknown.
-pub fn check_trained(run: &Run, capture: &Capture, views: &[&View], count: usize) -> Result<()> {
+/// The training views of a run in order of loading, without the images that masks hide as a whole: training left them out.
+///
+/// # Errors
+///
+/// Fails if they differ from the images that the run was trained on.
+pub fn trained<'c>(run: &Run, capture: &'c Capture) -> Result<Vec<&'c View>> {
+    let mut views = present(capture, Split::Train)?;
+    let names: HashSet<&String> = run.config.images.iter().collect();
+    views.retain(|view| names.is_empty() || view.mask.is_none() || names.contains(&view.name));
+    check_trained(run, capture, &views)?;
+    Ok(views)
+}
+
+fn check_trained(run: &Run, capture: &Capture, views: &[&View]) -> Result<()> {
+    // 0 if it is not known.
+    let count = run.config.scene_box.frames;
     let bad = |what: String| Err(Error::file(&capture.file, format!("{what}: name their folder with --scene")));
     if count > 0 && views.len() != count {
         return bad(format!("has {} training images, and the run was trained on {count}", views.len()));

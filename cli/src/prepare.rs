@@ -22,7 +22,7 @@ use raygrad::nerf::Error;
 use raygrad::nerf::dataset::Capture;
 
 use super::interrupt::Work;
-use super::output::{complain, listed, print};
+use super::output::{complain, listed, note, print, quoted};
 use super::parse;
 use super::scene::{Scene, assumptions};
 use super::shard::Shard;
@@ -32,6 +32,8 @@ use workplace::Workplace;
 
 /// Frames to take from a video by default.
 const FRAMES: usize = 120;
+/// The time between frames, in seconds, in which a walking person takes two steps.
+const SLOW: f64 = 1.0;
 /// Names of images in a message. Further ones are counted.
 const NAMED: usize = 8;
 
@@ -63,10 +65,10 @@ pub struct Args {
     undistort: bool,
     /// Frames to take from a video
     ///
-    /// raygrad extracts three times as many and keeps the sharpest.
-    #[arg(long, help_heading = "Scene", value_name = "N", default_value_t = FRAMES, value_parser = parse::count(10_000),
+    /// raygrad extracts three times as many and keeps the sharpest. [default: 120]
+    #[arg(long, help_heading = "Scene", value_name = "N", value_parser = parse::count(10_000),
           conflicts_with_all = ["to", "undistort"])]
-    frames: usize,
+    frames: Option<usize>,
     /// perspective or fisheye
     ///
     /// perspective: straight lines stay nearly straight. fisheye: they bend, as with action cameras.
@@ -135,11 +137,12 @@ pub fn run(args: &Args) -> Work<()> {
             conversion.run(&args.out)?;
         }
     }
-    Ok(next(args.out.display())?)
+    Ok(next(&args.out)?)
 }
 
 /// Prints the next commands for a dataset.
-fn next(out: std::path::Display<'_>) -> raygrad::nerf::Result<()> {
+fn next(out: &Path) -> raygrad::nerf::Result<()> {
+    let out = quoted(out);
     print(&format!("next     raygrad doctor {out}   to check it\n         raygrad train {out}   to train on it\n"))
 }
 
@@ -164,6 +167,9 @@ fn prepare(args: &Args) -> Work<()> {
         return Err(Error::file(input, "there is no such file or folder").into());
     }
     if !input.is_file() {
+        if args.frames.is_some() {
+            return Err(Error::setting("frames", "is for videos, and all images of a folder are taken").into());
+        }
         match Capture::read(input) {
             Ok(_) => {
                 let what = "already has camera poses: train on it, or choose a format to convert it to with --to";
@@ -180,7 +186,7 @@ fn prepare(args: &Args) -> Work<()> {
         }
     }
     let Args { frames, lens, allow_outside, ref out, .. } = *args;
-    make(&Input { path: input, frames, lens, allow_outside }, out)?;
+    make(&Input { path: input, frames: frames.unwrap_or(FRAMES), lens, allow_outside }, out)?;
     // The dataset is complete, so errors of the check are only warnings.
     let (scene, out) = (Scene::Folder(out.clone()), out.join("doctor"));
     if let Err(error) = doctor::run(&doctor::Args { scene, scene_type: None, out, overwrite: false, json: false }) {
@@ -201,12 +207,18 @@ fn make(input: &Input<'_>, out: &Path) -> Work<()> {
     }
     poses::check()?;
     let place = Workplace::new(out)?;
-    let count = match is_video {
-        true => video::frames(path, frames, &place)?,
-        false => photographs::copy(path, &images, allow_outside, &place)?,
+    let count = if is_video {
+        let (count, interval) = video::frames(path, frames, &place)?;
+        print(&format!("images   {count} sharp frames from {}, one in {interval:.2} s\n", path.display()))?;
+        if interval > SLOW {
+            note("these frames may overlap too little for COLMAP: --frames takes more of them");
+        }
+        count
+    } else {
+        let count = photographs::copy(path, &images, allow_outside, &place)?;
+        print(&format!("images   {count} images from {}\n", path.display()))?;
+        count
     };
-    let what = if is_video { "sharp frames from" } else { "images from" };
-    print(&format!("images   {count} {what} {}\n", path.display()))?;
     let found = poses::find(&place, is_video, lens.model())?;
     place.finish()?;
     report(&found, count, out)

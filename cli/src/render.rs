@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 
 use super::interrupt::{self, Stop, Work};
 use super::merge;
-use super::output::{check_writable, checksum, note, other_numbered, parent, print};
+use super::output::{check_writable, note, other_numbered, parent, print, quoted};
 use super::overwrite::{Job, png_with_text};
 use super::precision::{Precision, Renderer};
 use super::progress::{Progress, spoken};
@@ -192,7 +192,7 @@ pub fn run(args: &Args) -> Work<()> {
     }
     // The checksums are computed before the files are read. If a file is replaced meanwhile, frames of both models
     // never mix in one video.
-    let stored = [checksum(&run.model_file())?, checksum(&run.file("config.json"))?];
+    let stored = run.checksums()?;
     let mut model = run.model()?;
     if let Some(skip) = args.skip {
         model.set_skip(skip);
@@ -270,7 +270,7 @@ pub fn merge(complete: Complete) -> Work<()> {
         _ => folder.clone(),
     };
     let (frames, job) = Frames::of_shards(complete, of)?;
-    let again = format!("run `raygrad merge {}`", folder.display());
+    let again = format!("run `raygrad merge {}`", quoted(&folder));
     output.complete(frames, &job, &out, &again)
 }
 

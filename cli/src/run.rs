@@ -15,7 +15,7 @@ use serde_json::Value;
 
 use super::cameras::Viewpoint;
 use super::lock::{Lock, State};
-use super::output::{make_folder, parent, remove};
+use super::output::{checksum, make_folder, parent, quoted, remove};
 use super::scene::{Opened, Scene};
 use super::scratch;
 
@@ -98,12 +98,15 @@ impl Run {
     ///
     /// # Errors
     ///
-    /// Fails if it is not writable, or another program has created a run there meanwhile.
+    /// Fails if it is not writable, another program has created a run there meanwhile, or the configuration is one that
+    /// [`open`](Self::open) refuses.
     pub fn create(folder: PathBuf, config: RunConfig) -> Result<(Run, Lock)> {
+        config.check()?;
         make_folder(&folder)?;
         let run = Run { folder, config };
         let lock = run.lock()?;
         if run.file("config.json").exists() {
+            drop(lock);
             return Err(holds_a_run(&run.folder));
         }
         run.write()?;
@@ -235,8 +238,25 @@ impl Run {
         Ok(opened)
     }
 
+    /// Fails if training was stopped before its first step.
+    fn check_model(&self) -> Result<()> {
+        if self.model_file().exists() {
+            return Ok(());
+        }
+        let resume = format!("raygrad train --resume {}", quoted(&self.folder));
+        let what = format!("has no model yet: training has not begun. If it was stopped, resume it with `{resume}`");
+        Err(Error::file(&self.folder, what))
+    }
+
+    /// The CRC-32 of model and configuration.
+    pub fn checksums(&self) -> Result<[String; 2]> {
+        self.check_model()?;
+        Ok([checksum(&self.model_file())?, checksum(&self.file("config.json"))?])
+    }
+
     /// Loads the last saved model.
     pub fn model(&self) -> Result<Model<f32>> {
+        self.check_model()?;
         Model::load(self.model_file(), self.config.config.clone(), self.config.scene_box)
     }
 }
@@ -257,13 +277,7 @@ impl RunConfig {
         if self.downscale == 0 {
             return Err(Error::setting("downscale", "is 0; use 1 or more"));
         }
-        let [near, far] = self.scene_box.near_far;
-        if !(near >= 0.0 && near < far && far.is_finite()) {
-            return Err(Error::setting(
-                "scene_box.near_far",
-                format!("is {near} to {far}; near must be at least 0 and less than far"),
-            ));
-        }
+        self.scene_box.check()?;
         let kept = self.keep_checkpoints;
         if !CHECKPOINTS.contains(&kept) {
             let (fewest, most) = CHECKPOINTS.into_inner();

@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::lock::{Lock, State, UNFINISHED};
-use super::output::{check_writable, complain, entries, listed, remove};
+use super::output::{check_writable, complain, entries, listed, quoted, remove};
 use super::parse::read_text;
 use super::run::write_json;
 use super::scratch::ScratchFolder;
@@ -203,7 +203,7 @@ pub fn check_none(at: &Path) -> Result<()> {
     if records(at)?.is_empty() {
         return Ok(());
     }
-    let (folder, merge) = (at.join(FOLDER), at.display());
+    let (folder, merge) = (at.join(FOLDER), quoted(at));
     let what = format!("holds shards: finish them with `raygrad merge {merge}`, or remove {}", folder.display());
     Err(Error::file(at, what))
 }

@@ -6,6 +6,7 @@ use std::time::Instant;
 use raygrad::nerf::model::PoseMotion;
 use raygrad::nerf::{Budget, Result, StepStats};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::machine;
 use super::run::{Run, write_json};
@@ -94,6 +95,12 @@ struct Shares {
     placed_samples: f64,
     density_queries: f64,
     color_queries: f64,
+}
+
+/// Training steps and seconds at the last checkpoint, if the file can be read.
+pub fn trained(run: &Run) -> Option<(u64, f64)> {
+    let summary: Value = serde_json::from_slice(&std::fs::read(run.file(FILE)).ok()?).ok()?;
+    Some((summary["steps"].as_u64()?, summary["train_seconds"].as_f64()?))
 }
 
 /// Collects the summary of a run during training.

@@ -20,7 +20,7 @@ use serde_json::Value;
 
 use super::interrupt::Work;
 use super::lock::Lock;
-use super::output::{complain, print};
+use super::output::{complain, print, quoted};
 use super::prepare::beside;
 use super::preview::Preview;
 use super::progress::spoken;
@@ -38,7 +38,8 @@ pub use config::changed;
 /// How often a run that has diverged goes back to its last checkpoint.
 const RETREATS: u32 = 3;
 /// End of the message for a run that has used up its budget.
-const FINISHED: &str = ", the end of its budget: add --steps or --budget with a larger total to train on";
+const FINISHED: &str =
+    ", the end of its budget: add --steps or --budget with a larger total, from the start of the run, to train on";
 
 /// Options of new runs only.
 const NEW: [&str; 19] = [
@@ -108,7 +109,7 @@ pub struct Args {
     budget: Option<Duration>,
     /// Training steps, instead of a time
     ///
-    /// The same seed and number of steps give the same model, bit for bit.
+    /// The same seed and number of steps give the same model, bit for bit, on processors with the same instruction set.
     #[arg(long, help_heading = "Time", value_name = "N", value_parser = parse::within(1u64..))]
     steps: Option<u64>,
     /// Enlarge training steps N times
@@ -189,6 +190,9 @@ pub struct Args {
     /// total, counted from the start of the run.
     #[arg(long, help_heading = "Time", value_name = "RUN", conflicts_with_all = NEW)]
     resume: Option<PathBuf>,
+    /// With --resume: where the images are now
+    #[arg(id = "moved", long = "scene", help_heading = "Scene", value_name = "SCENE")]
+    moved: Option<Scene>,
     /// Time to wait for an MPI rank
     ///
     /// After this time without a message from a rank, the run ends with its number. It must be longer than rank 0
@@ -275,6 +279,9 @@ pub fn run(args: &Args) -> Work<Trained> {
     if !args.view && args.place.are_given() {
         return Err(Error::setting("view", "is missing: --host and --port need --view").into());
     }
+    if args.moved.is_some() && args.resume.is_none() {
+        return Err(Error::setting("scene", "is for --resume: name the scene of a new run without a flag").into());
+    }
     // Binds the port first, before files are created.
     let listener = args.view.then(|| args.place.listen()).transpose()?;
     match &args.resume {
@@ -285,7 +292,7 @@ pub fn run(args: &Args) -> Work<Trained> {
 
 /// Trains a new run.
 fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
-    let folder = choose_folder(args.out.as_deref())?;
+    let mut folder = choose_folder(args.out.as_deref())?;
     let source = match &args.scene {
         Scene::Folder(input) if beside::is_unprepared(input) => Scene::Folder(beside::dataset(input)?),
         scene => scene.clone(),
@@ -305,7 +312,22 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     let config = args.config(&data)?;
     let background = config.background.shown();
     let trainer = Trainer::new(config, data.clone())?;
-    let (run, lock) = Run::create(folder, args.run_config((&source, &scene), downscale, &trainer, &data)?)?;
+    let run_config = args.run_config((&source, &scene), downscale, &trainer, &data)?;
+    // Before the first file.
+    interrupt::listen();
+    let (run, lock) = loop {
+        match Run::create(folder.clone(), run_config.clone()) {
+            // Without --out, another program may have taken the folder since.
+            Err(error) if args.out.is_none() => {
+                let other = choose_folder(None)?;
+                if other == folder {
+                    return Err(error.into());
+                }
+                folder = other;
+            }
+            created => break created?,
+        }
+    };
     describe(&run, &trainer, &data, &scene)?;
     // Warnings come after all checks, so that an error is the only line of output.
     doctor::warn(&scene);
@@ -406,30 +428,35 @@ fn reopen(run: &Run) -> Result<(Opened, Arc<Dataset>, Trainer)> {
 /// Resumes a run from its last checkpoint.
 fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trained> {
     let mut run = Run::open(folder)?;
+    let before = run.config.clone();
+    if let Some(scene) = &args.moved {
+        run.config.scene = scene.absolute()?;
+    }
     let budget = match (args.given(), run.config.budget) {
         (Some(budget), _) | (None, Some(budget)) => budget,
         (None, None) => return Err(Error::setting("budget", "the run has none: add --budget or --steps")),
     };
+    let mut lock = run.lock()?;
     let (scene, data, mut trainer) = reopen(&run)?;
     let (downscale, background) = (run.config.downscale, run.config.config.background.shown());
-    let mut lock = run.lock()?;
+    // Before the first file.
+    interrupt::listen();
     run.sweep();
     checkpoint::load(&run, &mut trainer)?;
     run.keep(&mut lock)?;
-    let kept = args.keep_checkpoints.unwrap_or(run.config.keep_checkpoints);
-    let last = RunConfig {
-        raygrad: env!("CARGO_PKG_VERSION").to_owned(),
-        budget: Some(budget),
-        keep_checkpoints: kept,
-        ..run.config.clone()
-    };
-    if run.config != last {
-        run.config = last;
+    let stats = trainer.stats();
+    let is_over = watch::remaining(budget, &stats).0 >= 1.0;
+    run.config.raygrad = env!("CARGO_PKG_VERSION").to_owned();
+    run.config.keep_checkpoints = args.keep_checkpoints.unwrap_or(run.config.keep_checkpoints);
+    // A total that the run is beyond has no effect, and a later --resume goes on to the old one.
+    if !is_over {
+        run.config.budget = Some(budget);
+    }
+    if run.config != before {
         run.write()?;
     }
     describe(&run, &trainer, &data, &scene)?;
-    let stats = trainer.stats();
-    let end = if watch::remaining(budget, &stats).0 < 1.0 { "" } else { FINISHED };
+    let end = if is_over { FINISHED } else { "" };
     print(&format!("resumed  at step {}{end}\n", stats.step))?;
     let preview = Preview::choose(&scene, downscale, &data, background);
     train((run, lock), trainer, budget, args, preview, listener)
@@ -449,8 +476,6 @@ fn train(
     share(&mut trainer, &run, budget, timeout)?;
     let sent = |trainer: &mut Trainer| trainer.exchange_mut().map(|exchange| exchange.sent_bytes());
     let before = (trainer.stats().step, sent(&mut trainer));
-    // Before the first file and the link of the viewer.
-    interrupt::listen();
     let mut window = listener.map(|listener| TrainingViewer::open(listener, &run, &trainer)).transpose()?;
     let mut watch = Watch::new((&run, lock), &trainer, budget, args.checkpoint_every, preview, args.tensorboard)?;
     let (mut diverged, mut ended_by_page, mut interrupted) = (None, false, false);
@@ -470,7 +495,7 @@ fn train(
         interrupted = match ranks::any_is_interrupted(&mut trainer, interrupt::requested()) {
             Ok(interrupted) => interrupted,
             Err(error) => {
-                let what = format!("{error}; resume the run with raygrad train --resume {}", run.folder.display());
+                let what = format!("{error}; resume the run with raygrad train --resume {}", quoted(&run.folder));
                 return Err(Error::setting("mpi", what));
             }
         };
@@ -564,5 +589,5 @@ fn summarise(run: &Run, stats: &StepStats, interrupted: bool) -> Result<()> {
         stats.rays as f64 / stats.train_seconds.max(1e-9),
         run.model_file().display()
     ))?;
-    if interrupted { print(&format!("resume   raygrad train --resume {}\n", run.folder.display())) } else { Ok(()) }
+    if interrupted { print(&format!("resume   raygrad train --resume {}\n", quoted(&run.folder))) } else { Ok(()) }
 }

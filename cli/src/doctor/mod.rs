@@ -12,7 +12,7 @@ use raygrad::nerf::dataset::{Capture, SceneType};
 use raygrad::nerf::doctor::{DoctorOptions, Finding, FindingKind, Report, Severity, examine, examine_cameras};
 use raygrad::nerf::{Error, Result, write_atomic};
 
-use super::output::{complain, make_folder, print};
+use super::output::{complain, make_folder, print, quoted};
 use super::overwrite::{Job, png_with_text};
 use super::parse;
 use super::progress::Progress;
@@ -93,7 +93,7 @@ pub fn warn(scene: &Opened) {
     let said = |finding: &Finding| finding.kind == FindingKind::ImagesAbsent;
     for Finding { kind, severity, what, .. } in findings.iter().filter(|finding| !said(finding)) {
         if *severity > Severity::Note {
-            let folder = capture.folder.display();
+            let folder = quoted(&capture.folder);
             complain(&format!("{severity}: {kind}: {what}; `raygrad doctor {folder}` shows details"));
         }
     }

@@ -141,8 +141,7 @@ pub fn run(args: &Args) -> Work<()> {
     let run = Run::open(&args.run)?;
     // The checksum is computed before the model is read. If the file is replaced meanwhile, the result does not name
     // the new model.
-    let crc32 = checksum(&run.model_file())?;
-    let config = checksum(&run.file("config.json"))?;
+    let [crc32, config] = run.checksums()?;
     let mut model = run.model()?;
     let identity = Identity::of(&run, &model, crc32);
     let lpips = args.lpips.as_ref().map(Lpips::open).transpose()?;

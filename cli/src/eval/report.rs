@@ -13,6 +13,7 @@ use super::alignment::{Alignment, Appearance};
 use crate::precision::Precision;
 use crate::run::{Run, RunConfig};
 use crate::scene::Scene;
+use crate::summary;
 
 /// Number of evenly spaced views that are drawn, in addition to the worst ones.
 const PICTURES: usize = 10;
@@ -140,7 +141,8 @@ pub struct Identity {
     pub seed: u64,
     /// Training budget.
     pub budget: Option<Budget>,
-    /// Training steps and seconds, from the last line of `metrics.jsonl`.
+    /// Training steps and seconds at the checkpoint of the model, from `summary.json`; without it, from the last line of
+    /// `metrics.jsonl`.
     pub steps: Option<u64>,
     pub train_seconds: Option<f64>,
 }
@@ -149,7 +151,8 @@ impl Identity {
     /// The identity of the model in a run's file with this checksum.
     pub fn of(run: &Run, model: &Model<f32>, crc32: String) -> Self {
         let metrics = std::fs::read_to_string(run.file("metrics.jsonl")).unwrap_or_default();
-        let last = metrics.lines().rev().find_map(|line| serde_json::from_str::<StepStats>(line).ok());
+        let logged = || metrics.lines().rev().find_map(|line| serde_json::from_str::<StepStats>(line).ok());
+        let trained = summary::trained(run).or_else(|| logged().map(|stats| (stats.step, stats.train_seconds)));
         let RunConfig { raygrad, images, budget, config, .. } = &run.config;
         Identity {
             crc32,
@@ -160,8 +163,8 @@ impl Identity {
             images: images.len(),
             seed: config.seed,
             budget: *budget,
-            steps: last.map(|stats| stats.step),
-            train_seconds: last.map(|stats| stats.train_seconds),
+            steps: trained.map(|(steps, _)| steps),
+            train_seconds: trained.map(|(_, seconds)| seconds),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Images that share a camera.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use raygrad::nerf::Result;
@@ -34,14 +34,16 @@ pub struct Cameras {
     pub single: Vec<usize>,
 }
 
-/// Groups images by lens and size. Images without EXIF data share a camera if all of them have one size.
+/// Groups images by lens and size. Images without EXIF data share a camera if all of them have one size, or that size
+/// turned: as portraits and landscapes.
 pub fn group(images: &[About]) -> Cameras {
     let mut groups: BTreeMap<(&Option<Lens>, [usize; 2]), Vec<usize>> = BTreeMap::new();
     for (i, image) in images.iter().enumerate() {
         groups.entry((&image.lens, image.size)).or_default().push(i);
     }
-    let sizes = groups.keys().filter(|(lens, _)| lens.is_none()).count();
-    let is_shared = |lens: &Option<Lens>, group: &[usize]| group.len() > 1 && (lens.is_some() || sizes == 1);
+    let unknown = groups.keys().filter(|(lens, _)| lens.is_none());
+    let is_one_size = unknown.map(|(_, [w, h])| [w.min(h), w.max(h)]).collect::<BTreeSet<_>>().len() == 1;
+    let is_shared = |lens: &Option<Lens>, group: &[usize]| group.len() > 1 && (lens.is_some() || is_one_size);
     let mut cameras = Cameras { shared: vec![], single: vec![] };
     for ((lens, _), group) in groups {
         if is_shared(lens, &group) { cameras.shared.push(group) } else { cameras.single.extend(group) }
@@ -72,9 +74,10 @@ mod tests {
             grouped(&[(normal, wide), (ultra, wide), (normal, tall), (normal, wide), (ultra, wide), (Some(77), wide)]),
             (vec![vec![0, 3], vec![1, 4]], vec![2, 5])
         );
-        // Without EXIF data, images share a camera if they have one size.
+        // Without EXIF data, images share a camera if they have one size, or that size turned.
         assert_eq!(grouped(&[(None, wide), (None, wide), (None, wide)]), (vec![vec![0, 1, 2]], vec![]));
-        assert_eq!(grouped(&[(None, wide), (None, tall), (None, wide)]), (vec![], vec![0, 1, 2]));
+        assert_eq!(grouped(&[(None, wide), (None, tall), (None, wide)]), (vec![vec![0, 2]], vec![1]));
+        assert_eq!(grouped(&[(None, wide), (None, [8, 3]), (None, wide)]), (vec![], vec![0, 1, 2]));
         assert_eq!(
             grouped(&[(None, wide), (normal, tall), (None, wide), (normal, tall)]),
             (vec![vec![0, 2], vec![1, 3]], vec![])

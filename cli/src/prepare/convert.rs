@@ -268,9 +268,8 @@ pub fn merge(complete: Complete) -> Work<()> {
     if let Err(e) = std::fs::remove_dir_all(&at) {
         complain(&format!("warning: {}: cannot be removed: {e}", at.display()));
     }
-    let out = out.display();
-    print(&format!("scene    {out}: {images} cameras\n"))?;
-    Ok(next(out)?)
+    print(&format!("scene    {}: {images} cameras\n", out.display()))?;
+    Ok(next(&out)?)
 }
 
 /// Removes the temporary files that killed shards left in a dataset.

@@ -54,8 +54,8 @@ pub fn is_video(file: &Path) -> bool {
 }
 
 /// Writes about `count` sharp frames of a video to `images`. Of each three consecutive candidates, the sharpest is
-/// kept.
-pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
+/// kept. Returns how many there are and how many seconds each stands for.
+pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<(usize, f64)> {
     let input = file_url(video)?;
     let mut question: Vec<&OsStr> =
         ["-hide_banner", "-nostdin", "-protocol_whitelist", "file", "-i"].map(OsStr::new).to_vec();
@@ -89,7 +89,7 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
     }
     let kept = keep_sharp(&candidates, count, &place.make("images")?, &progress)?;
     place.remove(FOLDER);
-    Ok(kept)
+    Ok((kept, about.seconds / kept as f64))
 }
 
 impl Video {

@@ -6,7 +6,7 @@ use raygrad::nerf::dataset::{Dataset, SceneType};
 use raygrad::nerf::losses::DepthConfig;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
-use raygrad::nerf::{Budget, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
+use raygrad::nerf::{Budget, ClassicConfig, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
 use serde_json::Value;
 
 use super::super::cameras::Viewpoint;
@@ -51,6 +51,10 @@ impl Args {
             config = with_term(config, kind, *weight)?;
         }
         if self.no_positional_encoding {
+            if config.field.get::<ClassicConfig>().is_none() {
+                let what = format!("the preset {} has none: add --preset small or classic", self.preset);
+                return Err(Error::setting("no-positional-encoding", what));
+            }
             config = config.without_positional_encoding();
         }
         // A number of steps gives the same model on any machine.

@@ -12,7 +12,7 @@ use super::cache::{Cache, Cached};
 use super::messages::{AboutPhotograph, rows};
 use super::requests::Requests;
 use crate::eval::alignment::Appearance;
-use crate::photographs::{check_trained, present};
+use crate::photographs::{present, trained};
 use crate::run::Run;
 use crate::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
 
@@ -63,7 +63,7 @@ impl PhotoCache {
         let mut entries = vec![];
         for split in Split::ALL {
             // A capture may lack splits.
-            let Ok(views) = present(&capture, split) else { continue };
+            let Ok(mut views) = present(&capture, split) else { continue };
             // Without a validation split, its views are the test views.
             let names = |views: &[&View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
             let are_tests = |tests: Vec<&View>| names(&tests) == names(&views);
@@ -71,7 +71,7 @@ impl PhotoCache {
                 continue;
             }
             if split == Split::Train {
-                check_trained(run, &capture, &views, run.config.scene_box.frames)?;
+                views = trained(run, &capture)?;
             }
             entries.extend(views.into_iter().enumerate().map(|(number, view)| {
                 let given = transform.camera(&view.camera);

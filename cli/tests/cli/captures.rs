@@ -312,6 +312,24 @@ fn eval_of_training_images_as_test_is_an_error() {
     place.fails("export run other.json", &["has other training images than the run"]);
 }
 
+/// Training leaves such an image out, and so do all commands that need the training cameras.
+#[test]
+fn images_that_masks_hide_have_no_cameras() {
+    let place = Place::with_scene();
+    let mask = Image { width: SIZE, height: SIZE, channels: 1, data: vec![0.0; SIZE * SIZE] };
+    mask.save_png(place.path("scene/mask.png")).unwrap();
+    let mut train = place.transforms(Split::Train);
+    train["frames"][2]["mask_path"] = json!("mask.png");
+    place.write_transforms(Split::Train, &train);
+    place.succeeds(&format!("train scene --steps 1 --out run {SMALL} --refine poses"));
+    place.succeeds("render run --path spline --keyframes 0,4 --frames 2 --size 4x4");
+    let said = place.succeeds("export run cameras.json");
+    assert!(said.contains(" cameras, 5 of them refined"), "{said}");
+    // Another image that is absent is not hidden.
+    std::fs::remove_file(place.path("scene/train/r_4.png")).unwrap();
+    place.fails("export run other.json", &["has 4 training images, and the run was trained on 5"]);
+}
+
 #[test]
 fn forward_facing_capture_trains_in_ndc() {
     let place = Place::with_scene();

@@ -379,7 +379,8 @@ fn built_in_scenes_convert_to_other_formats() {
         "prepare landscape --to colmap --size 15 --out other",
         "`size`: is 15; the landscape is 4:3, so use a multiple of 4",
     );
-    place.fails_with("prepare absent --to colmap --size 16 --out other", "absent: there is no such folder");
+    place.fails_with("prepare absent --to colmap --out other", "absent: there is no such folder");
+    place.fails("prepare embedded-made --to colmap --size 16 --out other", &["`size`: is for built-in scenes"]);
     assert!(!place.path("other").exists());
 }
 

@@ -499,6 +499,10 @@ fn embedded_scene_needs_no_files() {
     let place = Place::empty();
     let printed = place
         .succeeds(&format!("train --steps 1 --downscale 10 --no-positional-encoding --background random {CLASSIC}"));
+    place.fails(
+        "train --steps 1 --downscale 10 --no-positional-encoding",
+        &["`no-positional-encoding`: the preset instant has none: add --preset small or classic"],
+    );
     assert!(printed.contains("embedded: 60 images of 20x20") && printed.contains("raygrad eval run"), "{printed}");
     let config = place.json("run/config.json");
     assert_eq!([&config["scene"], &config["config"]["background"]], ["embedded", "random"]);

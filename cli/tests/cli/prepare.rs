@@ -9,12 +9,13 @@ use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-/// Replaces ffmpeg: logs its arguments and writes 30 frames, of which the second of every three is sharp.
+/// Replaces ffmpeg: logs its arguments and writes 30 frames of `LENGTH` seconds, of which the second of every three is
+/// sharp.
 const FFMPEG: &str = r#"#!/bin/sh
 echo "ffmpeg $*" >> "$LOG"
 case "$*" in
   *"-i"*"%06d.jpg") ;;
-  *-i*) echo "  Duration: 00:00:10.00, start: 0.000000, bitrate: 1 kb/s" >&2
+  *-i*) echo "  Duration: 00:00:${LENGTH:-10}.00, start: 0.000000, bitrate: 1 kb/s" >&2
      echo "  Stream #0:0: Video: h264, yuv420p, 16x8, 30 fps, 30 tbr" >&2
      echo "At least one output file must be specified" >&2; exit 1 ;;
   *) exit 0 ;;
@@ -299,7 +300,7 @@ fn made(place: &Place) -> Vec<String> {
 fn video_becomes_a_dataset_of_sharp_frames() {
     let place = place();
     let said = succeeds(&place, "prepare walk.mp4 --out made --frames 10");
-    assert!(said.contains("images   10 sharp frames from walk.mp4\n"), "{said}");
+    assert!(said.contains("images   10 sharp frames from walk.mp4, one in 1.00 s\n"), "{said}");
     assert!(said.contains("cameras  8 of 10 images registered, in the largest of 2 models\n"), "{said}");
     assert!(said.contains("no pose  frame_00009.jpg, frame_00010.jpg\n"), "{said}");
     // The doctor ran: cameras in a row that look the same way give findings.
@@ -324,6 +325,12 @@ fn video_becomes_a_dataset_of_sharp_frames() {
     );
     assert!(place.path("made/sparse/0/cameras.txt").exists() && !place.path("made/sparse/1").exists());
     assert_eq!(std::fs::metadata(place.path("made")).unwrap().permissions().mode() & 0o700, 0o700);
+    // Frames of a long video are farther apart.
+    let output = command(&place, "prepare walk.mp4 --out long --frames 10").env("LENGTH", "45").output().unwrap();
+    let [said, notes] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    assert!(said.contains("images   10 sharp frames from walk.mp4, one in 4.50 s\n"), "{said}");
+    assert!(notes.contains("may overlap too little for COLMAP: --frames takes more"), "{notes}");
+    complained("a folder", &run(&place, "prepare photos --out other --frames 9"), &["`frames`: is for videos"]);
     // It is a dataset, and no second one overwrites it.
     place.succeeds(&format!("train made --scene-type bounded --steps 1 {CLASSIC}"));
     complained("again", &run(&place, "prepare walk.mp4 --out made"), &["made: is not empty", "--out"]);
@@ -337,13 +344,13 @@ fn images_become_an_upright_dataset() {
     for name in ["._0.JPG", ".DS_Store", ".hidden.png"] {
         std::fs::write(place.path(&format!("photos/{name}")), "no image").unwrap();
     }
-    // Stored in landscape, shown in portrait: the size differs, so each image has its own camera.
+    // Stored in landscape, shown in portrait: the size is turned, so only the others share a camera.
     std::fs::write(place.path("photos/turned.jpg"), jpeg(4, 6)).unwrap();
     let said = succeeds(&place, "prepare photos --out made --lens fisheye");
     assert!(said.contains("images   6 images from photos\ncameras  4 of 6 images"), "{said}");
-    assert!(
-        ran(&place, &["feature_extractor", "camera_model OPENCV_FISHEYE"]) && !log(&place).contains("single_camera")
-    );
+    let extractors = log(&place).lines().filter(|line| line.contains("camera_model OPENCV_FISHEYE")).count();
+    let shared = ["feature_extractor", "single_camera 1", "--image_list_path", "camera-0.txt"];
+    assert!(extractors == 2 && ran(&place, &shared), "{}", log(&place));
     assert!(ran(&place, &["exhaustive_matcher"]) && !log(&place).contains("ffmpeg"));
     assert_eq!(place.bytes("made/images/0.JPG"), place.bytes("photos/0.JPG"));
     assert_eq!(Photo::size_of_file(place.path("made/images/turned.jpg")).unwrap(), [[8, 16]; 2]);

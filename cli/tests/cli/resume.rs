@@ -249,6 +249,40 @@ fn resume_needs_the_lock_and_the_training_images() {
     place.fails("train --resume run --steps 5", &["run: ", "other images"]);
 }
 
+#[test]
+fn runs_resume_with_images_that_moved_and_totals_from_their_start() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 3 --out run {SMALL}"));
+    std::fs::rename(place.path("scene"), place.path("moved")).unwrap();
+    place.fails("train --resume run --steps 4", &["the run's images are no longer here", "with --scene"]);
+    let said = place.succeeds("train --resume run --scene moved --steps 4");
+    assert!(said.contains("resumed  at step 3\n") && said.contains("trained  4 steps"), "{said}");
+    let folder = place.json("run/config.json")["scene"]["folder"].clone();
+    assert!(folder.as_str().unwrap().ends_with("moved"), "{folder}");
+    place.fails("train moved --scene moved", &["`scene`: is for --resume"]);
+    // Two more steps are meant; the total stays.
+    let said = place.succeeds("train --resume run --steps 2");
+    assert!(said.contains("at step 4, the end of its budget") && said.contains("from the start of the run"), "{said}");
+    assert_eq!(place.json("run/config.json")["budget"]["steps"], 4);
+    // The checkpoints of a changed configuration are not damaged.
+    let config = String::from_utf8(place.bytes("run/config.json")).unwrap();
+    std::fs::write(place.path("run/config.json"), config.replacen("\"seed\": 0", "\"seed\": 9", 1)).unwrap();
+    place.fails("train --resume run --steps 5", &["The checkpoint is intact. If config.json was changed, restore"]);
+    std::fs::write(place.path("run/config.json"), config).unwrap();
+    // An evaluation states the steps of the model, although training was killed later.
+    let mut metrics = place.bytes("run/metrics.jsonl");
+    let last = metrics.split(|byte| *byte == b'\n').rfind(|line| !line.is_empty()).unwrap().to_vec();
+    let mut later: Value = serde_json::from_slice(&last).unwrap();
+    later["step"] = 900.into();
+    metrics.extend(format!("{later}\n").bytes());
+    std::fs::write(place.path("run/metrics.jsonl"), metrics).unwrap();
+    let result: Value = serde_json::from_str(&place.succeeds("eval run --views 1 --json")).unwrap();
+    assert_eq!(result["model"]["steps"], 4);
+    // Before the first checkpoint there is no model.
+    std::fs::remove_file(place.path("run/model.safetensors")).unwrap();
+    place.fails("render run --out x.png", &["run: has no model yet", "`raygrad train --resume run`"]);
+}
+
 /// A run that ended after 20 steps, in the first version with checkpoints. All later versions must resume it.
 #[test]
 fn checkpoint_of_first_version_resumes() {
