@@ -1,6 +1,6 @@
 //! The doctor names faults planted in a good capture, and finds none in the capture itself.
 
-use raygrad::nerf::dataset::{Capture, Format, Point, SceneAnalysis, SceneType, Split, View, evenly_spaced};
+use raygrad::nerf::dataset::{Capture, Depths, Format, Point, SceneAnalysis, SceneType, Split, View, evenly_spaced};
 use raygrad::nerf::doctor::{
     DoctorOptions, Finding, FindingKind as Kind, Report, Resolution, Severity, examine, examine_cameras,
 };
@@ -501,6 +501,35 @@ fn tinted(image: &Image, factors: [f32; 3]) -> Image {
         (0..3).for_each(|i| pixel[i] *= factors[i]);
     }
     out
+}
+
+#[test]
+fn doctor_compares_the_unit_of_depths_with_points() {
+    let (mut planted, scene) = (Planted::new(), Scene::bulldozer());
+    planted.capture.views.truncate(40);
+    // Points on the surfaces that every fourth camera sees; others do not see all of them.
+    for view in planted.capture.views.iter().step_by(4) {
+        let pixels = (0..SIZE * SIZE).step_by(97).map(|i| view.camera.pixel_ray(i % SIZE, i / SIZE));
+        let places = pixels.filter_map(|ray| Some(ray.at(scene.trace(&ray)?.distance)));
+        planted.capture.points.extend(places.map(|position| Point { position, color: [0; 3], error: 0.5, views: 4 }));
+    }
+    for view in 0..40 {
+        let camera = planted.camera(view).clone();
+        let rays = (0..SIZE * SIZE).map(|i| camera.pixel_ray(i % SIZE, i / SIZE));
+        let data = rays.map(|ray| scene.trace(&ray).map_or(0.0, |hit| hit.distance as f32)).collect();
+        let distances = Image { width: SIZE, height: SIZE, channels: 1, data };
+        let path = planted.folder.path().join(format!("{view}.npy"));
+        std::fs::write(&path, Depths::new(&distances, &camera, 1.0).to_npy()).unwrap();
+        planted.capture.views[view].depth = Some((path, 1.0));
+    }
+    assert!(planted.report().finds(Kind::DepthUnit).is_none());
+    for unit in [1e-3, 1e3, 2.0] {
+        planted.capture.views.iter_mut().for_each(|view| view.depth.as_mut().unwrap().1 = unit);
+        let report = planted.report();
+        let finding = report.finds(Kind::DepthUnit).unwrap();
+        let factor: f64 = finding.what.split(' ').nth(3).unwrap().parse().unwrap();
+        assert!(finding.severity == Warning && (factor / unit - 1.0).abs() < 0.02, "{}", finding.what);
+    }
 }
 
 #[test]

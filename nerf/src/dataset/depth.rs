@@ -116,6 +116,20 @@ impl Depths {
         decoded(path.as_ref()).map(drop)
     }
 
+    /// Reads a depth file, in its own unit.
+    pub(crate) fn read(path: &Path) -> Result<Self> {
+        let (size, values) = decoded(path)?;
+        Ok(Depths { size, values: values.into_iter().map(|depth| depth as f32).collect() })
+    }
+
+    /// The depth at a place, in shares of the sides; `None` outside of the image.
+    pub(crate) fn at(&self, place: [f64; 2]) -> Option<f64> {
+        let [width, height] = self.size;
+        let inside = place.iter().all(|share| (0.0..1.0).contains(share));
+        let [x, y] = [place[0] * width as f64, place[1] * height as f64].map(|x| x as usize);
+        inside.then(|| self.values.get(y * width + x).map(|depth| f64::from(*depth)))?
+    }
+
     /// The most bytes of memory while a depth file is decoded, from its header.
     pub(super) fn decoding_memory(path: impl AsRef<Path>) -> Result<u64> {
         let path = path.as_ref();

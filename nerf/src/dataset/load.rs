@@ -281,7 +281,11 @@ impl Capture {
     /// # Errors
     /// As [`SceneAnalysis::new`].
     pub fn analyze_cutout(&self, asked: Option<SceneType>) -> Result<SceneAnalysis> {
-        SceneAnalysis::new(self, Some(EmptyBackground::Masks), asked)
+        let analysis = SceneAnalysis::new(self, Some(EmptyBackground::Masks), asked)?;
+        let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
+        // Loading reports errors.
+        let is_hollow = |view: &&&View| self.cutout(view).is_ok_and(|photo| photo.is_hollow());
+        Ok(SceneAnalysis { hollow: 2 * looked_at.iter().filter(is_hollow).count() > looked_at.len(), ..analysis })
     }
 
     /// Reads one image at full size, in the orientation of its camera, without its mask.

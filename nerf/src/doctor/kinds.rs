@@ -133,6 +133,11 @@ kinds! {
     Scale = "scale", Warning,
         "the cameras' spacing is {} times their distance from the points of the scene",
         "Give camera positions and points in one unit: one of them may be in millimetres.";
+    /// Measured depths have another unit than the points.
+    DepthUnit = "depth-unit", Warning,
+        "measured depths are {} times the distances of the points behind their pixels",
+        "Divide `depth_unit_scale_factor` by this number: depths are its multiples, in the unit of the camera positions. \
+         Depths that a network guessed from single images have no unit: train without --depth-loss.";
     /// Coordinates are so large that digits are lost.
     FarFromOrigin = "far-from-origin", Note,
         "the cameras are {} units from the origin and {} from each other",
@@ -217,8 +222,8 @@ kinds! {
     /// Images are transparent within an opaque border.
     HollowAlpha = "hollow-alpha", Warning,
         "the alpha channel of {} is transparent inside an opaque border",
-        "Alpha is 0 where the background is empty. If it is 0 on the object, invert it. To hide something that moved, \
-         use masks.";
+        "Alpha is 0 where the background is empty. If it is 0 on the object, invert it, or the masks of \
+         --mask-as-alpha. To hide something that moved, use masks without that flag.";
     /// Colour profiles cannot be read.
     ColorProfile = "color-profile", Note,
         "cannot read the colour profile of {}; colours count as sRGB",

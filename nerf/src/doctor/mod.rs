@@ -5,6 +5,7 @@
 
 mod agreement;
 mod consistency;
+mod depths;
 mod kinds;
 mod layout;
 mod look;
@@ -61,6 +62,7 @@ pub fn examine(capture: &Capture, analysis: Result<&SceneAnalysis, &Error>, opti
     let mut facts = without_pixels(capture, analysis.ok(), &mut findings);
     let looks = look::look_at_all(capture, options.progress);
     pixels::unreadable(&looks, &mut findings);
+    depths::examine(capture, &mut findings);
     let seen: Vec<Seen<'_>> =
         looks.iter().filter_map(|(view, look)| Some(Seen { view, look: look.as_ref().ok()? })).collect();
     pixels::examine(&seen, &mut findings);

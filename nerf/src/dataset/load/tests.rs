@@ -394,6 +394,14 @@ fn masks_as_alpha_cut_out_the_object() {
     capture.views.iter_mut().for_each(|view| view.mask = Some(path.clone()));
     let analysis = capture.analyze_cutout(None).unwrap();
     assert_eq!((analysis.scene_type, &analysis.reason[..25]), (SceneType::Bounded, "masks cut out an object; "));
+    // Masks that are inverted leave a border in place of an object.
+    let inverted = folder.path().join("inverted.png");
+    let inside = |i: usize| (3..9).contains(&(i % 12)) && (2..6).contains(&(i / 12));
+    let data = (0..96).map(|i| if inside(i) { 0.0 } else { 1.0 }).collect();
+    std::fs::write(&inverted, Image { width: 12, height: 8, channels: 1, data }.to_png()).unwrap();
+    let mut wrong = capture.clone();
+    wrong.views.iter_mut().for_each(|view| view.mask = Some(inverted.clone()));
+    assert_eq!([&wrong, &capture].map(|capture| capture.analyze_cutout(None).unwrap().hollow), [true, false]);
     assert_eq!(capture.analyze_cutout(Some(SceneType::Unbounded)).unwrap().scene_type, SceneType::Unbounded);
     assert_ne!(capture.analyze_scene(None).unwrap().scene_type, SceneType::Bounded);
     let options = LoadOptions { mask_as_alpha: true, ..LoadOptions::default() };
