@@ -13,7 +13,15 @@ use smallvec::SmallVec;
 /// own reference, so a recorded pass goes through the plain operations.
 struct Checkpoint<F> {
     f: F,
+    /// For each argument of `f`, the number of its input. A variable that is given twice is one input: `f` may take
+    /// gradients, and those of a copy would be others.
+    places: SmallVec<[usize; 4]>,
     shape: Shape,
+}
+
+/// The arguments of a checkpointed function, from the inputs.
+fn arguments<'a, T: Scalar>(places: &[usize], inputs: &[Var<'a, T>]) -> Vec<Var<'a, T>> {
+    places.iter().map(|&place| inputs[place].clone()).collect()
 }
 
 impl<T, F> Op<T> for Checkpoint<F>
@@ -30,7 +38,7 @@ where
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        run(&self.f, &Tape::with_pool(pool.clone()), x)
+        run(&self.f, &self.places, &Tape::with_pool(pool.clone()), x)
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
@@ -39,18 +47,10 @@ where
 
     fn try_vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Result<Grads<'t, T>, Error> {
         let (tape, at) = (cx.tape().nested(), cx.tape().line());
-        // One leaf for each variable, even if it is several inputs: its shares then arrive in one order.
-        let first = |i: usize| (0..i).find(|&j| cx.edges[j] == cx.edges[i] && cx.needs(j)).unwrap_or(i);
-        let mut x: Vec<Var<'_, T>> = Vec::with_capacity(cx.len());
-        for i in 0..cx.len() {
-            // Inputs whose gradient is not needed are leaves too: `f` may take gradients with respect to them.
-            x.push(match cx.needs(i) && first(i) < i {
-                true => x[first(i)].clone(),
-                false => tape.unchecked_leaf(cx.input(i).clone(), at),
-            });
-        }
-        let leaves: SmallVec<[usize; 4]> = (0..cx.len()).filter(|&i| cx.needs(i) && first(i) == i).collect();
-        let y = (self.f)(&x);
+        // Inputs whose gradient is not needed are leaves too: `f` may take gradients with respect to them.
+        let x: Vec<Var<'_, T>> = (0..cx.len()).map(|i| tape.unchecked_leaf(cx.input(i).clone(), at)).collect();
+        let leaves: SmallVec<[usize; 4]> = (0..cx.len()).filter(|&i| cx.needs(i)).collect();
+        let y = (self.f)(&arguments(&self.places, &x));
         let seed = tape.constant(cx.g().value().clone());
         let mut given: Vec<Option<Given<'t, T>>> = vec![None; cx.len()];
         let wanted: Vec<_> = leaves.iter().map(|&i| &x[i]).collect();
@@ -71,14 +71,20 @@ where
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        Some((self.f)(&x.iter().map(Var::tracked).collect::<Vec<_>>()))
+        let x: Vec<_> = x.iter().map(Var::tracked).collect();
+        Some((self.f)(&arguments(&self.places, &x)))
     }
 }
 
 /// The value of `f` on a temporary tape. It is recorded there, so that `f` may take gradients.
-fn run<T: Scalar>(f: impl for<'a> Fn(&[Var<'a, T>]) -> Var<'a, T>, tape: &Tape<T>, x: &[&Tensor<T>]) -> Tensor<T> {
+fn run<T: Scalar>(
+    f: impl for<'a> Fn(&[Var<'a, T>]) -> Var<'a, T>,
+    places: &[usize],
+    tape: &Tape<T>,
+    x: &[&Tensor<T>],
+) -> Tensor<T> {
     let x: Vec<_> = x.iter().map(|&x| tape.unchecked_leaf(x.clone(), tape.line())).collect();
-    f(&x).into_value()
+    f(&arguments(places, &x)).into_value()
 }
 
 impl<T: Scalar> Tape<T> {
@@ -116,10 +122,16 @@ impl<T: Scalar> Tape<T> {
         for x in inputs {
             assert!(std::ptr::eq(x.tape(), self), "checkpoint: an input belongs to another tape");
         }
-        let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| x.value()).collect();
-        let value = run(&f, &self.nested(), &values);
+        let (mut unique, mut places) = (SmallVec::<[&Var<'t, T>; 4]>::new(), SmallVec::new());
+        for &x in inputs {
+            let known = unique.iter().position(|other| x.node.is_some() && other.node == x.node);
+            places.push(known.unwrap_or(unique.len()));
+            unique.extend(known.is_none().then_some(x));
+        }
+        let values: SmallVec<[&Tensor<T>; 4]> = unique.iter().map(|x| x.value()).collect();
+        let value = run(&f, &places, &self.nested(), &values);
         let shape = Shape::from_slice(value.shape());
-        self.record(Box::new(Checkpoint { f, shape }), inputs, value, self.line())
+        self.record(Box::new(Checkpoint { f, places, shape }), &unique, value, self.line())
     }
 }
 
@@ -166,6 +178,26 @@ mod tests {
             all.iter().flat_map(bits).collect::<Vec<_>>()
         };
         assert_eq!(run(true), run(false));
+    }
+
+    /// Gradients that `f` takes know that two arguments are one variable, in all runs.
+    #[test]
+    fn gradients_inside_count_a_variable_that_is_given_twice_once() {
+        fn slope<'t>(x: &[Var<'t, f64>]) -> Var<'t, f64> {
+            (x[0].square() * &x[1]).grad_graph(&[&x[0]]).remove(0)
+        }
+        let tape = Tape::<f64>::new();
+        let (x, other) = (tape.leaf(Tensor::scalar(3.0)), tape.leaf(Tensor::scalar(3.0)));
+        let y = tape.checkpoint(&[&x, &x], slope);
+        // 3 x^2, and its derivatives.
+        let graph = y.grad_graph(&[&x]).remove(0);
+        assert_eq!(
+            [y.item(), y.grad(&[&x])[0].item(), graph.item(), graph.grad(&[&x])[0].item()],
+            [27.0, 18.0, 18.0, 6.0]
+        );
+        // 2 x y for different variables.
+        let y = tape.checkpoint(&[&x, &other], slope);
+        assert_eq!([y.item(), y.grad(&[&x])[0].item()], [18.0, 6.0]);
     }
 
     #[test]

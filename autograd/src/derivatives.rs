@@ -229,7 +229,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     /// The Hessian-vector product of this one-element tensor, recorded: for each of `wrt`, the derivative of its
-    /// gradient when all move along their tangents.
+    /// gradient when all move along their tangents. Tangents may depend on the variables; the product treats them as
+    /// constants, and is recorded as a function of both.
     ///
     /// # Panics
     /// If this tensor has not exactly one element, and where [`jvp`](Self::jvp) panics.
@@ -237,7 +238,12 @@ impl<'t, T: Scalar> Var<'t, T> {
     pub fn hvp(&self, wrt: &[&Var<'t, T>], tangents: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
         let products = self.tape.enable_grad(|| {
             let grads = self.grad_graph(wrt);
-            inner(self.tape, "hvp", &grads, tangents).tracked().grad_graph(wrt)
+            check_tangents(self.tape, "hvp", &grads, tangents);
+            // The Hessian is symmetric. A gradient of `grads . tangents` would also differentiate the tangents.
+            match joined(&grads.iter().collect::<Vec<_>>()).zip(joined(tangents)) {
+                Some((grads, tangents)) => grads.tracked().vjp(&tangents, wrt),
+                None => vec![],
+            }
         });
         products.into_iter().map(Var::recorded_or_constant).collect()
     }
@@ -330,15 +336,35 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 }
 
-/// `sum_i a_i . v_i`, for the derivative `op` along the tangents v.
+/// Checks that there is a tangent of the same shape for each gradient.
 #[track_caller]
-fn inner<'t, T: Scalar>(tape: &'t Tape<T>, op: &'static str, a: &[Var<'t, T>], v: &[&Var<'t, T>]) -> Var<'t, T> {
+fn check_tangents<'t, T: Scalar>(tape: &'t Tape<T>, op: &'static str, a: &[Var<'t, T>], v: &[&Var<'t, T>]) {
     let count = || format!("{} tangents for {} variables", v.len(), a.len());
     tape.fits(op, v, ensure(a.len() == v.len(), count));
-    let mut total: Option<Var<'t, T>> = None;
     for (a, v) in a.iter().zip(v) {
         let shape = || "a tangent has the shape of its variable".to_owned();
         tape.fits(op, &[a, *v], ensure(a.shape() == v.shape(), shape));
+    }
+}
+
+/// All elements in one row; the variable itself if there is only one.
+fn joined<'t, T: Scalar>(all: &[&Var<'t, T>]) -> Option<Var<'t, T>> {
+    match all {
+        [] => None,
+        [one] => Some((*one).clone()),
+        all => {
+            let rows: Vec<_> = all.iter().map(|x| x.reshape(&[x.value().len()])).collect();
+            Some(Var::concat(&rows.iter().collect::<Vec<_>>(), 0))
+        }
+    }
+}
+
+/// `sum_i a_i . v_i`, for the derivative `op` along the tangents v.
+#[track_caller]
+fn inner<'t, T: Scalar>(tape: &'t Tape<T>, op: &'static str, a: &[Var<'t, T>], v: &[&Var<'t, T>]) -> Var<'t, T> {
+    check_tangents(tape, op, a, v);
+    let mut total: Option<Var<'t, T>> = None;
+    for (a, v) in a.iter().zip(v) {
         let product = (a * *v).sum();
         total = Some(match total {
             Some(total) => total + product,
@@ -490,6 +516,29 @@ mod tests {
         let inside = tape.no_grad(|| f.jvp(&[&a], &[&one]));
         assert!(!inside.is_on_graph() && inside.item() == fa.item());
         assert_close(fa.jacobian(&[&a, &b])[1].as_slice(), &[c * e], 1e-14);
+    }
+
+    /// A gradient of `grads . tangents` would differentiate the tangents too.
+    #[test]
+    fn hessian_products_hold_tangents_fixed() {
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::scalar(2.0));
+        let product = x.powi(3).hvp(&[&x], &[&x]).remove(0);
+        // 6 x v, and as a function of x = v its derivative 12 x.
+        assert_eq!([product.item(), product.grad(&[&x])[0].item()], [24.0, 24.0]);
+        let [a, b] = [[1.0, -2.0], [0.5, 3.0]].map(|x| tape.leaf(Tensor::from(x)));
+        let y = ((&a * &b).sin() + a.square() * &b).sum();
+        let tangents = y.grad_graph(&[&a, &b]);
+        let fixed: Vec<_> = tangents.iter().map(Var::detach).collect();
+        let [moving, fixed] = [&tangents, &fixed].map(|v| y.hvp(&[&a, &b], &v.iter().collect::<Vec<_>>()));
+        for (moving, fixed) in moving.iter().zip(fixed) {
+            assert_eq!(moving.value(), fixed.value());
+        }
+        // Half of the squared norm of the gradient has the gradient H g.
+        let norm = (tangents[0].square().sum() + tangents[1].square().sum()) * 0.5;
+        for (gradient, product) in norm.grad(&[&a, &b]).iter().zip(&moving) {
+            assert_close(gradient.as_slice(), product.value().as_slice(), 1e-14);
+        }
     }
 
     #[test]

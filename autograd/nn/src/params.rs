@@ -112,6 +112,14 @@ impl<T: Scalar> Params<T> {
         id
     }
 
+    /// Panics as [`add`](Self::add) does if one of these names is taken, before any is added.
+    #[track_caller]
+    pub(crate) fn assert_free(&self, layer: &str, names: &[&str]) {
+        for name in names.iter().map(|name| format!("{layer}.{name}")) {
+            assert!(self.find(&name).is_none(), "there is already a parameter `{name}`");
+        }
+    }
+
     /// Number of parameters; each is one tensor.
     pub fn len(&self) -> usize {
         self.values.len()

@@ -30,7 +30,8 @@ thread_local! {
 /// meanwhile. At its end a process calls [`finalize`](Self::finalize), or [`abort`](Self::abort) if it has failed.
 ///
 /// A rank that hangs while it sends a message ends the job at once, after a line on standard error: MPI cannot give
-/// the buffers of such messages back. A rank that hangs elsewhere is an [error](ExchangeError::TimedOut).
+/// the buffers of such messages back. A rank that hangs elsewhere is an [error](ExchangeError::TimedOut). If it
+/// goes on after the others have given up, it finds that they receive nothing, and ends the job too.
 #[derive(Debug)]
 pub struct Mpi {
     rank: usize,

@@ -3,6 +3,8 @@
 use super::{Exchange, ExchangeError, FirstError, next_round};
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{TcpListener, TcpStream, ToSocketAddrs};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -11,10 +13,15 @@ use std::time::{Duration, Instant};
 const SHORTEST: Duration = Duration::from_millis(1);
 const LONGEST: Duration = Duration::from_secs(1 << 30);
 
+/// Time between looks at whether a writer should give up.
+const LOOK: Duration = Duration::from_millis(50);
+
 /// Time between attempts to connect.
 const RETRY: Duration = Duration::from_millis(20);
 
 /// Ranks connected by TCP, where there is no MPI. Each pair of ranks has one connection.
+///
+/// A rank is lost if it sends nothing for the timeout. A large message may take longer.
 ///
 /// Connections are neither encrypted nor authenticated: use it in a network whose machines are trusted.
 #[derive(Debug)]
@@ -33,14 +40,39 @@ struct Peer {
     /// To the thread that writes, so that two ranks that send much to each other do not wait for one another.
     outgoing: Option<Sender<Vec<u8>>>,
     writer: Option<JoinHandle<()>>,
+    /// Milliseconds without progress after which the writer gives up. It does not while the exchange is in use: the other
+    /// rank may be busy with a third one, and if it hangs, the reader notices.
+    patience: Arc<AtomicU64>,
+    /// That number for the end of the exchange.
+    last_patience: u64,
 }
 
 impl Drop for Peer {
     /// Waits until the last messages are sent: the other rank may still need them.
     fn drop(&mut self) {
+        self.patience.store(self.last_patience, Relaxed);
         self.outgoing = None;
         self.writer.take().map(JoinHandle::join);
     }
+}
+
+/// Writes a message. Waits for the other rank to read.
+fn write(stream: &mut TcpStream, mut message: &[u8], patience: &AtomicU64) -> io::Result<()> {
+    let mut moved = Instant::now();
+    while !message.is_empty() {
+        match stream.write(message) {
+            Ok(0) => return Err(ErrorKind::WriteZero.into()),
+            Ok(count) => (message, moved) = (&message[count..], Instant::now()),
+            Err(error) if error.kind() == ErrorKind::Interrupted => {}
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
+                if moved.elapsed().as_millis() > patience.load(Relaxed).into() {
+                    return Err(error);
+                }
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(())
 }
 
 impl Tcp {
@@ -80,7 +112,7 @@ impl Tcp {
             let stream = retry(until, || call(address, until)).map_err(|error| absent(other, error))?;
             let mut own = &stream;
             own.write_all(&greeting(rank, addresses.len())).map_err(|error| absent(other, error))?;
-            peers[other] = Some(Peer::new(stream, timeout).map_err(|error| absent(other, error))?);
+            peers[other] = Some(Peer::new(stream, timeout, addresses.len()).map_err(|error| absent(other, error))?);
         }
         for _ in rank + 1..addresses.len() {
             let missing = || (rank + 1..addresses.len()).find(|&other| peers[other].is_none()).unwrap_or(rank);
@@ -90,7 +122,7 @@ impl Tcp {
                 let what = format!("rank {rank}: a second rank {other} connects to its address");
                 return Err(ExchangeError::Connection(what));
             }
-            peers[other] = Some(Peer::new(stream, timeout).map_err(|error| absent(other, error))?);
+            peers[other] = Some(Peer::new(stream, timeout, addresses.len()).map_err(|error| absent(other, error))?);
         }
         Ok(Tcp { rank, peers, timeout, sent: 0, failed: None })
     }
@@ -142,21 +174,26 @@ fn accept(listener: &TcpListener, rank: usize, ranks: usize) -> io::Result<(usiz
 }
 
 impl Peer {
-    fn new(incoming: TcpStream, timeout: Duration) -> io::Result<Self> {
+    fn new(incoming: TcpStream, timeout: Duration, ranks: usize) -> io::Result<Self> {
         incoming.set_nodelay(true)?;
+        incoming.set_write_timeout(Some(LOOK))?;
         let mut stream = incoming.try_clone()?;
         let (outgoing, messages) = channel::<Vec<u8>>();
+        let patience = Arc::new(AtomicU64::new(u64::MAX));
+        let own = patience.clone();
         // It ends with the sender. If the connection breaks, the reader notices.
-        let write = move || drop(messages.iter().try_for_each(|message| stream.write_all(&message)));
-        let peer = Peer { incoming, outgoing: Some(outgoing), writer: Some(std::thread::spawn(write)) };
-        peer.set_timeout(timeout)?;
+        let write = move || drop(messages.iter().try_for_each(|message| write(&mut stream, &message, &own)));
+        let (outgoing, writer) = (Some(outgoing), Some(std::thread::spawn(write)));
+        let mut peer = Peer { incoming, outgoing, writer, patience, last_patience: 0 };
+        peer.set_timeout(timeout, ranks)?;
         Ok(peer)
     }
 
-    fn set_timeout(&self, timeout: Duration) -> io::Result<()> {
+    /// At the end the other rank has the time to read a message of each of the others.
+    fn set_timeout(&mut self, timeout: Duration, ranks: usize) -> io::Result<()> {
         let timeout = timeout.clamp(SHORTEST, LONGEST);
-        self.incoming.set_read_timeout(Some(timeout))?;
-        self.incoming.set_write_timeout(Some(timeout))
+        self.last_patience = timeout.as_millis() as u64 * ranks as u64;
+        self.incoming.set_read_timeout(Some(timeout))
     }
 
     fn receive(&mut self) -> io::Result<Vec<u8>> {
@@ -186,7 +223,8 @@ impl Exchange for Tcp {
     fn set_timeout(&mut self, timeout: Duration) {
         self.timeout = timeout;
         // A connection that refuses it has ended, which the next exchange finds.
-        self.peers.iter().flatten().for_each(|peer| drop(peer.set_timeout(timeout)));
+        let ranks = self.peers.len();
+        self.peers.iter_mut().flatten().for_each(|peer| drop(peer.set_timeout(timeout, ranks)));
     }
 
     fn sent_bytes(&self) -> u64 {
@@ -311,6 +349,42 @@ mod tests {
         };
         let ranks: Vec<_> = listeners.into_iter().enumerate().map(start).collect();
         ranks.into_iter().for_each(|rank| assert_eq!(rank.join().unwrap(), 20_000_000));
+    }
+
+    /// Rank 2 reads the message of rank 0, which takes longer than the timeout, before that of rank 1.
+    #[test]
+    fn messages_wait_for_ranks_that_are_busy_with_others() {
+        let timeout = Duration::from_millis(500);
+        let listeners: Vec<_> = (0..3).map(|_| TcpListener::bind("127.0.0.1:0").unwrap()).collect();
+        let addresses: Vec<_> = listeners.iter().map(|listener| listener.local_addr().unwrap()).collect();
+        let mut listeners = listeners.into_iter();
+        let slow = listeners.next().unwrap();
+        let slow = std::thread::spawn(move || {
+            let mut streams: Vec<_> =
+                (0..2).map(|_| retry(Instant::now() + TIMEOUT, || accept(&slow, 0, 3)).unwrap()).collect();
+            for (_, stream) in &mut streams {
+                stream.write_all(&4_u64.to_le_bytes()).unwrap();
+            }
+            for _ in 0..4 {
+                for (rank, stream) in &mut streams {
+                    if *rank == 1 { stream.write_all(&[0; 4]).unwrap() } else { stream.write_all(&[0]).unwrap() }
+                }
+                streams.retain(|(rank, _)| *rank == 2);
+                std::thread::sleep(Duration::from_millis(300));
+            }
+            std::thread::sleep(TIMEOUT / 20);
+        });
+        let ranks = listeners.enumerate().map(|(i, listener)| {
+            let addresses = addresses.clone();
+            std::thread::spawn(move || {
+                let mut tcp = Tcp::with_listener(i + 1, listener, &addresses, timeout).unwrap();
+                let part = vec![1; if i == 0 { 20_000_000 } else { 0 }];
+                tcp.all_to_all(&[&[], &part, &part]).map(|parts| parts[1].len())
+            })
+        });
+        let lengths: Vec<_> = ranks.collect::<Vec<_>>().into_iter().map(|rank| rank.join().unwrap()).collect();
+        assert_eq!(lengths, [Ok(20_000_000), Ok(20_000_000)]);
+        slow.join().unwrap();
     }
 
     #[test]

@@ -19,6 +19,10 @@ impl Conv2d {
     /// A layer `[n, channels, h, w] -> [n, outputs, oh, ow]`. Its parameters are `<name>.weight`
     /// `[outputs, channels, kernel height, kernel width]` and `<name>.bias` `[outputs]`. The bias starts at 0.
     /// [`Var::conv2d`] has the formulas for `oh` and `ow`.
+    ///
+    /// # Panics
+    /// If there is already a parameter of one of these names, or `init` is a negative deviation. None is added then.
+    #[track_caller]
     pub fn new<T: Scalar>(
         params: &mut Params<T>,
         name: &str,
@@ -29,11 +33,16 @@ impl Conv2d {
         init: Init,
         rng: &mut (impl Rng + ?Sized),
     ) -> Self {
+        params.assert_free(name, &["weight", "bias"]);
         let layer = Conv2d::without_bias(params, name, [channels, outputs], kernel, config, activation, init, rng);
         Conv2d { bias: Some(params.add(format!("{name}.bias"), Tensor::zeros(&[outputs]))), ..layer }
     }
 
     /// As [`new`](Self::new), without a bias.
+    ///
+    /// # Panics
+    /// As [`new`](Self::new).
+    #[track_caller]
     pub fn without_bias<T: Scalar>(
         params: &mut Params<T>,
         name: &str,

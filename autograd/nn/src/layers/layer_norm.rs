@@ -17,7 +17,12 @@ pub struct LayerNorm {
 impl LayerNorm {
     /// A layer `[.., width] -> [.., width]`. Its parameters are `<name>.gain`, which starts at 1, and `<name>.bias`,
     /// which starts at 0. It adds `eps` 1e-5 to the variance.
+    ///
+    /// # Panics
+    /// If there is already a parameter of one of these names. None is added then.
+    #[track_caller]
     pub fn new<T: Scalar>(params: &mut Params<T>, name: &str, width: usize) -> Self {
+        params.assert_free(name, &["gain", "bias"]);
         LayerNorm {
             gain: params.add(format!("{name}.gain"), Tensor::ones(&[width])),
             bias: params.add(format!("{name}.bias"), Tensor::zeros(&[width])),

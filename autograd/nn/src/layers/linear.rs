@@ -17,6 +17,10 @@ pub struct Linear {
 impl Linear {
     /// A layer `[.., inputs] -> [.., outputs]`. Its parameters are `<name>.weight` `[inputs, outputs]` and
     /// `<name>.bias` `[outputs]`. The bias starts at 0.
+    ///
+    /// # Panics
+    /// If there is already a parameter of one of these names, or `init` is a negative deviation. None is added then.
+    #[track_caller]
     pub fn new<T: Scalar>(
         params: &mut Params<T>,
         name: &str,
@@ -25,11 +29,16 @@ impl Linear {
         init: Init,
         rng: &mut (impl Rng + ?Sized),
     ) -> Self {
+        params.assert_free(name, &["weight", "bias"]);
         let layer = Linear::without_bias(params, name, sizes, activation, init, rng);
         Linear { bias: Some(params.add(format!("{name}.bias"), Tensor::zeros(&sizes[1..]))), ..layer }
     }
 
     /// As [`new`](Self::new), without a bias.
+    ///
+    /// # Panics
+    /// As [`new`](Self::new).
+    #[track_caller]
     pub fn without_bias<T: Scalar>(
         params: &mut Params<T>,
         name: &str,

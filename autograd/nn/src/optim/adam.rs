@@ -18,8 +18,8 @@ use serde::{Deserialize, Serialize};
 /// not fill memory with denormal numbers, which are slow. Gradients count as at most 1.1e18 (1e154 in f64), so that their
 /// squares are finite. Work runs on the current rayon pool; the result does not depend on the number of threads.
 ///
-/// For a lazy parameter ([`Params::set_lazy`], PyTorch's `SparseAdam`), rows without gradient are not read. Each row
-/// counts its own steps, so without gradient its moments do not decay and its bias correction does not change. A row
+/// For a lazy parameter ([`Params::set_lazy`]), rows without gradient are not read, as in PyTorch's `SparseAdam`. Unlike
+/// there, each row counts its own steps, and eps is corrected as in Adam. So without gradient its moments do not decay and its bias correction does not change. A row
 /// with one late gradient changes by about one learning rate. Dense Adam, whose bias correction has ended by then,
 /// changes it over the following steps too. If every row has a gradient in every step, both agree. A penalty on the
 /// whole table makes a gradient that does not consist of rows alone. A step then visits every row whose gradient is not

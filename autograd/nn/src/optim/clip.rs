@@ -41,7 +41,7 @@ pub fn global_norm<T: Scalar>(grads: &[Gradient<T>]) -> (f64, usize) {
 }
 
 /// Gradient clipping by norm: scales all gradients so that their common norm is at most `bound` (Pascanu, Mikolov and
-/// Bengio 2013, algorithm 1; `torch.nn.utils.clip_grad_norm_`).
+/// Bengio 2013, algorithm 1; `torch.nn.utils.clip_grad_norm_` without its 1e-6).
 ///
 /// The norm is that of the finite elements. Infinite elements and NaN stay unchanged, so that one bad element neither
 /// zeroes all others nor is hidden. Optimizers skip and count elements with such a gradient. Products below 1e-30

@@ -125,7 +125,8 @@ pub trait Optimizer<T: Scalar> {
     /// run, bit for bit. First make the same parameters [lazy](Params::set_lazy) as in that run.
     ///
     /// # Errors
-    /// If the state belongs to another kind of optimizer or to other parameters. If it belongs to a lazy parameter that
-    /// is not lazy here, or the reverse. The optimizer then does not change.
+    /// If the state belongs to another kind of optimizer or to other parameters. If it counts the steps of a lazy
+    /// parameter, as [`Adam`]'s does, and the parameter is not lazy here, or the reverse. The optimizer then does not
+    /// change.
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError>;
 }

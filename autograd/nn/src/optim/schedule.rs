@@ -87,6 +87,8 @@ impl Schedule {
                     false => rise(warmup) * from * factor.powf(half) * factor.powf(stairs - half),
                 }
             }
+            // Scaled by 0.
+            Schedule::Exponential { from: 0.0, .. } => 0.0,
             Schedule::Exponential { from, to, warmup } => rise(warmup) * from * (to / from).powf(fraction),
             Schedule::Cosine { from, to, warmup } => {
                 let half = |share: f64| (std::f64::consts::FRAC_PI_2 * share).sin().powi(2);
@@ -173,6 +175,7 @@ mod tests {
             let points = [0.0, 0.1, 0.3, 0.7, 1.0].map(|fraction| (fraction, 3.0 * schedule.lr(fraction)));
             assert_rates(schedule.scaled(3.0), &points);
             assert_eq!(schedule.scaled(1.0), schedule);
+            assert_rates(schedule.scaled(0.0), &points.map(|(fraction, _)| (fraction, 0.0)));
         }
     }
 

@@ -1,7 +1,10 @@
 //! What a store of parameters does.
 
 use super::*;
-use crate::{Optimizer, Sgd, SgdConfig, Storage, Tiles};
+use crate::{Init, LayerNorm, Linear, Optimizer, Sgd, SgdConfig, Storage, Tiles};
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+use raygrad_autograd::Activation;
 
 #[test]
 fn frozen_parameters_rest_others_have_own_lr() {
@@ -138,6 +141,28 @@ fn many_parameters_are_added_and_found_in_linear_time() {
 fn panic_of(f: impl FnOnce()) -> String {
     let error = std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)).expect_err("no panic");
     error.downcast_ref::<String>().cloned().unwrap_or_default()
+}
+
+#[test]
+fn layers_with_a_taken_name_add_nothing() {
+    for taken in ["layer.weight", "layer.gain", "layer.bias"] {
+        let mut params = Params::<f32>::new();
+        params.add(taken, Tensor::scalar(1.0));
+        let rng = &mut StdRng::seed_from_u64(1);
+        if taken != "layer.gain" {
+            let linear = || {
+                Linear::new(&mut params, "layer", [2, 3], Activation::Identity, Init::Glorot, rng);
+            };
+            assert_eq!(panic_of(linear), format!("there is already a parameter `{taken}`"));
+        }
+        if taken != "layer.weight" {
+            let norm = || {
+                LayerNorm::new(&mut params, "layer", 3);
+            };
+            assert_eq!(panic_of(norm), format!("there is already a parameter `{taken}`"));
+        }
+        assert_eq!(params.len(), 1);
+    }
 }
 
 #[test]

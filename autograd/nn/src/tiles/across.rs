@@ -97,6 +97,9 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
             let here = format!("this rank has {count} and {here}");
             return Err(format!("has {tiles} tiles and {trainable} parameters in this step, and {here}"));
         }
+        if reader.number().ok_or_else(damaged)? != fingerprint(params) {
+            return Err("has parameters of other names or shapes, or others are frozen there".into());
+        }
         let mut parts = vec![];
         for range in parts_of(0..count, &own) {
             let mut sums = TileSums::zero(params);
@@ -120,6 +123,14 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
         }
         if reader.0.is_empty() { Ok(parts) } else { Err(damaged()) }
     }
+}
+
+/// A number for the names and shapes of the parameters that are not frozen (FNV-1a). Frames have 32 bits for it on any
+/// machine.
+fn fingerprint<T: Scalar>(params: &Params<T>) -> usize {
+    let described = params.trainable().map(|id| format!("{} {:?}\n", params.name(id), params.get(id).shape()));
+    let bytes = described.flat_map(String::into_bytes);
+    bytes.fold(0x811c_9dc5_u32, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193)) as usize
 }
 
 /// The tiles of a rank.
@@ -158,6 +169,7 @@ pub(super) fn message<T: Scalar, R: Serialize>(
     let mut frame = Frame::default();
     frame.number(count);
     frame.number(params.trainable().count());
+    frame.number(fingerprint(params));
     for (_, TileSums { grads, results }) in parts {
         for result in results {
             let result = postcard::to_allocvec(result)

@@ -208,6 +208,28 @@ fn ranks_that_differ_are_named() {
     }
 }
 
+/// As many parameters of the same shape, but others.
+#[test]
+fn parameters_of_other_ranks_are_compared_by_name() {
+    let store = |frozen: &str, second: &str| {
+        let mut params = Params::<f32>::new();
+        params.add("a", Tensor::zeros(&[3]));
+        params.add(second, Tensor::zeros(&[3]));
+        params.freeze(|name| name == frozen);
+        params
+    };
+    let sums = |params: &Params<f32>| vec![(0..1, TileSums::<f32, f32>::zero(params))];
+    let mine = store("a", "b");
+    for (other, is_same) in [(store("b", "b"), false), (store("a", "c"), false), (store("a", "b"), true)] {
+        let mut parts = sums(&other);
+        parts[0].1.results.push(1.0);
+        let message = message(&other, 1, &parts).unwrap();
+        let read = Tiles::<f32>::new().receive::<f32>(&mine, 1, 0..1, &mut Reader(&message));
+        assert_eq!(read.is_ok(), is_same);
+        assert!(read.err().is_none_or(|what| what.contains("other names or shapes")));
+    }
+}
+
 #[test]
 fn messages_hold_sums_and_cut_ones_are_refused() {
     let (params, ids) = store();
