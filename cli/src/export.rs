@@ -17,7 +17,7 @@ use super::builtin;
 use super::interrupt::{self, Work};
 use super::output::{parent, print};
 use super::overwrite::Job;
-use super::photographs::trained;
+use super::photographs::{learned_transform, trained};
 use super::prepare::convert::{Conversion, Target, relative};
 use super::run::{Run, check_output};
 use super::scene::Scene;
@@ -134,8 +134,10 @@ pub fn run(args: &Args) -> Work<()> {
 /// The learned transform of all cameras is undone, since images do not determine it. So other cameras and the points
 /// keep their coordinates.
 fn refine(capture: &mut Capture, model: &Model<f32>, run: &Run) -> Result<usize> {
-    let Some(refine) = &model.camera_optimizer else { return Ok(0) };
-    let drift = refine.transform(&model.params).unwrap_or_default();
+    if model.camera_optimizer.is_none() {
+        return Ok(0);
+    }
+    let drift = learned_transform(model);
     let transform = model.scene_box.transform;
     let trained: HashMap<String, usize> =
         trained(run, capture)?.iter().enumerate().map(|(number, view)| (view.field.clone(), number)).collect();

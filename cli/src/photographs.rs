@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 
-use raygrad::nerf::dataset::{Capture, Split, View};
+use raygrad::nerf::dataset::{Capture, SceneTransform, Split, View};
 use raygrad::nerf::{Camera, Error, Model, Result};
 
 use super::run::Run;
@@ -40,6 +40,11 @@ pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: 
         bounds: bounds(view, transform.scale),
     };
     Ok(views.iter().zip(cameras).map(photograph).collect())
+}
+
+/// The learned transform of all cameras: from the scene coordinates of the capture to those of the model.
+pub fn learned_transform(model: &Model<f32>) -> SceneTransform {
+    model.camera_optimizer.as_ref().and_then(|refine| refine.transform(&model.params)).unwrap_or_default()
 }
 
 /// Near and far depth of a view in scene units. `scale` is the scale of the scene transform.

@@ -239,6 +239,11 @@ pub fn run(args: &Args) -> Work<()> {
     }
     let rendered = render(&shown, &cameras, &mut frames);
     if let Err(Stop::Interrupted) = rendered {
+        // Nothing resumes the video of a viewer that has ended.
+        if args.ends_with_input {
+            frames.remove();
+            return rendered;
+        }
         frames.stopped(AGAIN)?;
     }
     rendered?;

@@ -11,7 +11,7 @@ use serde::{Serialize, Serializer};
 
 use super::path_file::{self, Motion};
 use crate::cameras::{Viewpoint, fitted};
-use crate::photographs::{Photograph, photographs};
+use crate::photographs::{Photograph, learned_transform, photographs};
 use crate::run::Run;
 use crate::scene::Scene;
 use crate::{memory, parse};
@@ -188,9 +188,9 @@ impl CameraPathArgs {
                     }
                 };
                 let given: Vec<Camera> = keys.iter().map(|key| extent.transform.camera(&key.camera(usual))).collect();
-                // Poses follow the learned transform of the cameras. The lens is that of the file.
-                let found = model.other_cameras(&given).into_iter().zip(given);
-                (found.map(|(found, camera)| Camera { pose: found.pose, ..camera }).collect(), usual, fps)
+                // As the viewer, which writes such files, maps poses.
+                let learned = learned_transform(model);
+                (given.iter().map(|camera| learned.camera(camera)).collect(), usual, fps)
             }
         };
         let cameras = self.sized(&cameras, usual);

@@ -15,8 +15,8 @@ use raygrad::nerf::camera::{CameraPath, Curve, Keyframe};
 use raygrad::nerf::dataset::formats::rigid;
 use raygrad::nerf::glam::{DAffine3, DMat3, DQuat, DVec3};
 use raygrad::nerf::{Error, Result};
-use serde::Deserialize;
-use serde::de::DeserializeOwned;
+use serde::de::{DeserializeOwned, Error as _};
+use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use crate::output::note;
@@ -54,7 +54,9 @@ pub enum Motion {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Nerfstudio {
+    #[serde(deserialize_with = "side")]
     render_width: usize,
+    #[serde(deserialize_with = "side")]
     render_height: usize,
     camera_type: Option<String>,
     fps: Option<f64>,
@@ -196,6 +198,17 @@ fn parse<T: DeserializeOwned>(file: &File) -> Result<T> {
     serde_json::from_str(&text).map_err(|e| Error::file(file, format!("is malformed: {e}")))
 }
 
+/// A number of pixels, which nerfstudio's viewer writes as `1920.0`.
+fn side<'de, D: Deserializer<'de>>(deserializer: D) -> std::result::Result<usize, D::Error> {
+    let number = f64::deserialize(deserializer)?;
+    // Other numbers saturate, and are refused as sides.
+    if number.fract() == 0.0 {
+        Ok(number as usize)
+    } else {
+        Err(D::Error::custom(format!("{number} is no whole number")))
+    }
+}
+
 fn whole<T: DeserializeOwned>(file: &File, document: Value) -> Result<T> {
     serde_json::from_value(document).map_err(|e| Error::file(file, format!("is malformed: {e}")))
 }
@@ -227,7 +240,13 @@ fn nerfstudio(file: &File, path: Nerfstudio, to_capture: &DAffine3) -> Result<Pa
         if time.is_some() {
             return Err(bad(&format!("{name}.render_time"), "is not supported, because scenes are static: remove it"));
         }
-        key(file, &name, from_rows(matrix).map_err(|what| bad(&name, &what))?, fov, to_capture)
+        let mut pose = from_rows(matrix).map_err(|what| bad(&name, &what))?;
+        // Nerfstudio normalises directions, so axes may have a scale: Blender's add-on writes that of the scene.
+        let scale = pose.matrix3.determinant().cbrt();
+        if scale > 0.0 && scale.is_finite() {
+            pose.matrix3 *= scale.recip();
+        }
+        key(file, &name, pose, fov, to_capture)
     };
     let shots = path.camera_path.unwrap_or_default();
     let motion = match (shots.is_empty(), path.keyframes) {

@@ -26,6 +26,7 @@ use raygrad::nerf::{Model, Result};
 
 use super::checkpoint;
 use super::output::{complain, note, print};
+use super::photographs::learned_transform;
 use super::run::Run;
 use super::scene::Scene;
 use forward::ForwardPage;
@@ -162,10 +163,8 @@ fn about(run: &Run, model: &Model<f32>, photos: Option<&PhotoCache>, checkpoints
 /// The cameras of the images.
 fn taken(run: &Run, model: &Model<f32>, photos: Option<&PhotoCache>) -> Taken {
     // File coordinates map to the scene by the scene transform, then by the learned transform of all cameras.
-    let learned =
-        model.camera_optimizer.as_ref().and_then(|refine| refine.transform(&model.params)).unwrap_or_default();
     Taken {
-        to_capture: rows(&to_capture(&run.config.scene_box.transform, &learned)),
+        to_capture: rows(&to_capture(&run.config.scene_box.transform, &learned_transform(model))),
         photographs: photos.map_or(vec![], |photos| photos.about(model)),
     }
 }

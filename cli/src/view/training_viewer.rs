@@ -22,6 +22,8 @@ use crate::summary::Ended;
 const SHARE: f64 = 0.3;
 /// Most render time in seconds that carries over, so that a new request starts at once.
 const MOST_CREDIT: f64 = 0.1;
+/// The most time in seconds that renders owe to training.
+const MOST_DEBT: f64 = 1.0;
 /// Interval between messages on the state of training.
 const TOLD: Duration = Duration::from_millis(400);
 /// Interval between messages on the cameras with pose refinement.
@@ -231,9 +233,9 @@ fn is_owed(credit: f64) -> bool {
 }
 
 /// The due render time in seconds after training for `trained` seconds. Renders get `share` of the total time. Unused
-/// time carries over only up to a limit.
+/// time carries over only up to a limit, and so does the time of a large image, after which pages would wait for long.
 fn credit(before: f64, trained: f64, share: f64) -> f64 {
-    before.min(MOST_CREDIT) + trained * share / (1.0 - share)
+    before.clamp(-MOST_DEBT, MOST_CREDIT) + trained * share / (1.0 - share)
 }
 
 impl Curves {
@@ -261,7 +263,10 @@ mod tests {
         // For a second of training: a second at a fraction of a half, a ninth at a tenth.
         assert_eq!(credit(0.0, 1.0, 0.5), 1.0);
         assert!((credit(0.0, 1.0, 0.1) - 1.0 / 9.0).abs() < 1e-12);
-        assert_eq!([credit(0.0, 1.0, 0.0), credit(9.0, 0.0, 0.5), credit(-9.0, 0.0, 0.5)], [0.0, MOST_CREDIT, -9.0]);
+        assert_eq!(
+            [credit(0.0, 1.0, 0.0), credit(9.0, 0.0, 0.5), credit(-9.0, 0.0, 0.5)],
+            [0.0, MOST_CREDIT, -MOST_DEBT]
+        );
     }
 
     #[test]

@@ -49,20 +49,20 @@ impl Model<f32> {
         // Each camera gets the same number of rays, for any image size.
         let rays = RAYS * count as f64 / cameras.len().max(1) as f64;
         let scale = |camera: &Camera| (rays / (camera.width * camera.height) as f64).sqrt();
-        let views = views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done));
-        let seen = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten().map(|sight| sight.place));
         let probe = Probe::new(self, region);
         let region = probe.region();
-        let local = seen.map(|place| region.local(place));
-        let places: Vec<DVec3> = local.filter(|place| region.contains_local(*place)).collect();
+        let (mut places, mut seeing) = (Vec::<DVec3>::new(), Evaluations::default());
+        for (_, seen) in views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done)) {
+            let local = seen.sights.iter().flatten().map(|sight| region.local(sight.place));
+            places.extend(local.filter(|place| region.contains_local(*place)));
+            seeing = seeing + seen.evaluations;
+        }
         if places.is_empty() {
             return Err(Error::setting(
                 "points",
                 "cannot be found: no camera sees a surface in the box; train longer or check the cameras and the box",
             ));
         }
-        let seeing = views.iter().fold(Evaluations::default(), |sum, (_, seen)| sum + seen.evaluations);
-        drop(views);
         let sights = places.len();
         let positions = thinned(&places, count);
         progress(Stage::Coloring, 0.0);

@@ -34,22 +34,21 @@ pub(super) struct Seen {
     pub evaluations: Evaluations,
 }
 
-/// Renders the hit points of cameras resized by `scale`; also returns the resized cameras. `progress` receives the
-/// finished share.
+/// Renders the hit points of cameras resized by `scale`, one after another; also returns the resized cameras. `progress`
+/// receives the finished share.
 pub(super) fn views(
     model: &Model<f32>,
     cameras: &[Camera],
     scale: impl Fn(&Camera) -> f64,
     progress: &mut dyn FnMut(f64),
-) -> Vec<(Camera, Seen)> {
-    let view = |(i, camera): (usize, &Camera)| {
+) -> impl Iterator<Item = (Camera, Seen)> {
+    cameras.iter().enumerate().map(move |(i, camera)| {
         let [width, height] = [camera.width, camera.height].map(|side| (scale(camera) * side as f64).ceil() as usize);
         let camera = camera.resized(width, height);
         let seen = sights(model, &camera);
         progress((i + 1) as f64 / cameras.len() as f64);
         (camera, seen)
-    };
-    cameras.iter().enumerate().map(view).collect()
+    })
 }
 
 /// The hit points of a camera's pixels. Distances are exact up to a share of a render's step.

@@ -121,9 +121,9 @@ impl Model<f32> {
         config.check()?;
         let probe = Probe::new(self, config.region);
         let region = probe.region();
-        let views = if config.fill_unseen || config.iso_value.is_none() {
+        let views: Vec<_> = if config.fill_unseen || config.iso_value.is_none() {
             let scale = |camera: &Camera| (PIXELS / camera.width.max(camera.height) as f64).min(1.0);
-            views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done))
+            views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done)).collect()
         } else {
             vec![]
         };

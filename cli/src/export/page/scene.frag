@@ -220,5 +220,5 @@ void main() {
     sum *= (ended ? 1.0 : weightSum) / colored;
     if (ended) light = 0.0;
   }
-  result = vec4(min(sum * gain, 1.0) + light * background, 1.0);
+  result = vec4(min(sum * gain, 1.0 - light) + light * background, 1.0);
 }

@@ -278,7 +278,13 @@ try {
   picture.addEventListener("webglcontextlost", () => tell("The browser lost the graphics card: reload the page.", true));
   document.getElementById("reset").addEventListener("click", reset);
   reset();
-  new ResizeObserver(ask).observe(stage);
+  // A page may load before it is shown, in a window of size 0.
+  let shown = stage.clientHeight > 0;
+  new ResizeObserver(() => {
+    if (shown || stage.clientHeight === 0) return ask();
+    shown = true;
+    reset();
+  }).observe(stage);
 } catch (error) {
   tell(error.message, true);
 }

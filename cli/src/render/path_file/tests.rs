@@ -68,6 +68,27 @@ fn read_nerfstudio_frames_keeps_poses() {
     assert!(camera.focal.iter().all(|focal| (focal - 259.8076211353316).abs() < 1e-9), "{camera:?}");
 }
 
+/// The viewer writes sizes as floats, and Blender's add-on the scale of the scene in the axes.
+#[test]
+fn read_nerfstudio_accepts_float_sizes_and_scaled_axes() {
+    let mut document = nerfstudio_path();
+    (document["render_width"], document["render_height"]) = (json!(400.0), json!(300.0));
+    let mut scaled = POSE;
+    scaled.iter_mut().enumerate().filter(|(i, _)| *i < 12 && i % 4 < 3).for_each(|(_, value)| *value *= 2.5);
+    document["camera_path"][0]["camera_to_world"] = json!(scaled);
+    let path = of(&document, None, DAffine3::IDENTITY).unwrap();
+    assert_eq!(path.size, Some([400, 300]));
+    close(&shots(path)[0].pose, &POSE);
+    // Each axis has the same scale, and none is mirrored.
+    for (column, factor) in [(0, 1.1), (2, -1.0)] {
+        let mut wrong = POSE;
+        (0..3).for_each(|row| wrong[4 * row + column] *= factor);
+        document["camera_path"][0]["camera_to_world"] = json!(wrong);
+        let message = of(&document, None, DAffine3::IDENTITY).map(drop).unwrap_err().to_string();
+        assert!(message.contains("`camera_path[0]`: its pose must be"), "{message}");
+    }
+}
+
 #[test]
 fn read_nerfstudio_transform_is_inverted() {
     // The pose above in a world that is rotated by 0.7 about (1, 2, 3), translated by (0.1, -0.2, 0.3) and scaled by
@@ -212,6 +233,7 @@ fn read_unknown_fields_is_refused() {
     ns("/camera_type", json!("fisheye"), "`camera_type`: must be `perspective`");
     ns("/crop", json!({}), "`crop`: is not supported");
     ns("/render_width", json!(0), "`render_width`");
+    ns("/render_width", json!(400.5), "400.5 is no whole number");
     ns("/render_height", json!(100_000), "`render_width`: the image size is 400x100000; use 1 to 16384 pixels a side");
     ns("/fps", json!(-1.0), "`fps`");
     ns("/fps", json!(1000.0), "`fps`: is 1000; use 0.01 to 240");

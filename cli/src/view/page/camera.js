@@ -34,7 +34,8 @@ function place(pose, fov) {
 
 /** The vertical field of view at which a view of aspect ratio `own` fits into a window in both directions. */
 function fitting(fov, own, window) {
-  const half = Math.tan(0.5 * fov * radians) * Math.max(1, own / window);
+  // A page that is not shown has a window of size 0.
+  const half = Math.tan(0.5 * fov * radians) * (own > window && window > 0 ? own / window : 1);
   return clamp((2 * Math.atan(half)) / radians, 1, 120);
 }
 
@@ -115,8 +116,12 @@ function listen(stage) {
   });
   stage.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
+    if (!before || !bounds) return;
     // A third finger disables the gesture.
-    if (!before || !bounds || pointers.size > 2) return;
+    if (pointers.size > 2) {
+      pointers.set(event.pointerId, [event.clientX, event.clientY]);
+      return;
+    }
     const area = stage.getBoundingClientRect();
     const [dx, dy] = [(event.clientX - before[0]) / area.height, (event.clientY - before[1]) / area.height];
     if (pointers.size === 2) {

@@ -51,7 +51,10 @@ function connect() {
   const own = socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
   socket.onopen = () => { attempts = 0; $("lost").hidden = true; unseen = null; };
-  socket.onmessage = (event) => (typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data));
+  socket.onmessage = (event) => {
+    heard = performance.now();
+    return typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data);
+  };
   socket.onclose = async (event) => {
     // A new link has opened another socket.
     if (socket !== own) return;
@@ -67,6 +70,25 @@ function connect() {
     }
   };
 }
+
+/** Time of the last message, in milliseconds, and the longest silence before the page asks if raygrad is there. */
+let heard = 0;
+const SILENCE = 10000;
+
+// A network that comes back from sleep loses connections without closing them.
+async function probe() {
+  const isSilent = () => unseen !== null && performance.now() - Math.max(heard, unseen) > SILENCE;
+  if (document.hidden || socket.readyState !== WebSocket.OPEN || !isSilent()) return;
+  try {
+    await fetch(withToken("access"), { signal: AbortSignal.timeout(3000) });
+  } catch {
+    if (!isSilent()) return;
+    $("lost").textContent = "raygrad does not respond. Reconnecting…";
+    $("lost").hidden = false;
+    connect();
+  }
+}
+setInterval(probe, SILENCE / 2);
 
 // A new link, opened in the same tab.
 addEventListener("hashchange", () => {
@@ -137,6 +159,8 @@ function meet(message) {
   bounds = about.bounds;
   if (elsewhere) recall();
   overlaid = requested = null;
+  // A video that goes on says so.
+  $("video-progress").hidden = $("end-video").hidden = true;
   document.title = `${about.title} - raygrad`;
   $("title").textContent = about.title;
   $("photographs").hidden = about.photographs.length === 0;
@@ -330,10 +354,10 @@ document.addEventListener("keydown", (event) => {
   else if (event.key >= "1" && event.key <= "5") choose(modes[event.key - 1]);
   else {
     const buttons = { r: "reset", p: "save", n: "nearest", ",": "previous", ".": "next", k: "key" };
-    const button = buttons[event.key.toLowerCase()];
+    const key = event.key.toLowerCase(), button = buttons[key];
     if (button) $(button).click();
-    else if (event.key === "c") { $("cameras").checked = !$("cameras").checked; marksOf(); }
-    else if (event.key === "b") { $("blend").value = Number($("blend").value) ? 0 : 50; blend(); }
+    else if (key === "c") { $("cameras").checked = !$("cameras").checked; marksOf(); }
+    else if (key === "b") { $("blend").value = Number($("blend").value) ? 0 : 50; blend(); }
     else return;
   }
   event.preventDefault();
