@@ -9,7 +9,7 @@
 //! too, so its image is that of `off`, which leaves those cells out and nothing else. `bare` asks the field in those
 //! cells as well, where no image ever judged it.
 
-use raygrad::nerf::dataset::{Capture, LoadOptions, Split};
+use raygrad::nerf::dataset::{Capture, LoadOptions, Split, evenly_spaced};
 use raygrad::nerf::imaging::metrics::psnr;
 use raygrad::nerf::space::occupancy::{OccupancyGrid, Skip};
 use raygrad::nerf::{Camera, Config, Evaluations, Image, Model, SceneBox};
@@ -39,7 +39,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
         _ => return Err("the run's scene is neither `embedded` nor a folder".into()),
     };
-    let cameras: Vec<Camera> = views.frames.iter().take(VIEWS).map(|frame| frame.camera.resized(size, size)).collect();
+    let frames = evenly_spaced(views.frames, VIEWS);
+    let cameras: Vec<Camera> = frames.iter().map(|frame| frame.camera.resized(size, size)).collect();
 
     model.set_skip(Skip::Off);
     let (unskipped, counts, seconds) = render(&model, &cameras);

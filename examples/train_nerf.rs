@@ -5,8 +5,8 @@
 //! cargo run --release --example train_nerf [seconds] [folder for images]
 //! ```
 //!
-//! Trains for 60 seconds unless told otherwise. The scene is the embedded bulldozer; `dataset::load(folder, split, 2)?`
-//! in its place reads a capture at half its size. `Config::for_budget`, `with_scene_type`, `with_images` and
+//! Trains for 60 seconds unless told otherwise. The scene is the embedded bulldozer; `dataset::load(folder, split, 2)`
+//! returns the images of a capture at half its size, or an error. `Config::for_budget`, `with_scene_type`, `with_images` and
 //! `with_transparency` fit a preset to a budget and a capture, as `raygrad train` does.
 
 use raygrad::nerf::dataset::Split;

@@ -52,7 +52,7 @@ pub fn listed(names: &[String], most: usize) -> String {
 /// A path as a shell takes it, for commands in messages: in quotes if it has other characters than those of plain names.
 pub fn quoted(path: &Path) -> String {
     let path = path.display().to_string();
-    let is_plain = |c: char| c.is_alphanumeric() || "._-/\\:~+@,".contains(c);
+    let is_plain = |c: char| c.is_alphanumeric() || "._-/:+@,".contains(c) || cfg!(windows) && c == '\\';
     match path.chars().all(is_plain) {
         true => path,
         false if cfg!(windows) => format!("\"{path}\""),

@@ -63,9 +63,9 @@ pub struct Args {
     /// The images are cropped so that no pixel is empty.
     #[arg(long, help_heading = "Output")]
     undistort: bool,
-    /// Frames to take from a video
+    /// Frames to take from a video [default: 120]
     ///
-    /// raygrad extracts three times as many and keeps the sharpest. [default: 120]
+    /// raygrad extracts three times as many and keeps the sharpest.
     #[arg(long, help_heading = "Scene", value_name = "N", value_parser = parse::count(10_000),
           conflicts_with_all = ["to", "undistort"])]
     frames: Option<usize>,
@@ -210,8 +210,8 @@ fn make(input: &Input<'_>, out: &Path) -> Work<()> {
     let count = if is_video {
         let (count, interval) = video::frames(path, frames, &place)?;
         print(&format!("images   {count} sharp frames from {}, one in {interval:.2} s\n", path.display()))?;
-        if interval > SLOW {
-            note("these frames may overlap too little for COLMAP: --frames takes more of them");
+        if interval > SLOW && count >= frames {
+            note("these frames may overlap too little for COLMAP: `raygrad prepare --frames N` takes more of them");
         }
         count
     } else {

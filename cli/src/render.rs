@@ -247,7 +247,8 @@ pub fn run(args: &Args) -> Work<()> {
         frames.stopped(AGAIN)?;
     }
     rendered?;
-    let Some(shard) = shard else { return output.complete(frames, &job, &out, AGAIN) };
+    let again = if args.ends_with_input { None } else { Some(AGAIN) };
+    let Some(shard) = shard else { return output.complete(frames, &job, &out, again) };
     let folder = frames.folder().to_owned();
     frames.keep();
     merge::merge_if_complete(&folder, shard)
@@ -276,7 +277,7 @@ pub fn merge(complete: Complete) -> Work<()> {
     };
     let (frames, job) = Frames::of_shards(complete, of)?;
     let again = format!("run `raygrad merge {}`", quoted(&folder));
-    output.complete(frames, &job, &out, &again)
+    output.complete(frames, &job, &out, Some(&again))
 }
 
 /// What is made of the frames.
@@ -291,13 +292,18 @@ struct Output {
 
 impl Output {
     /// Makes the video and removes its frames, or keeps them. `again` is how to resume after an interruption.
-    fn complete(&self, frames: Frames, job: &Job, out: &Path, again: &str) -> Work<()> {
+    fn complete(&self, frames: Frames, job: &Job, out: &Path, again: Option<&str>) -> Work<()> {
         let &Output { kind, frames: count, size, fps, keep_frames } = self;
         if let Kind::Video(video) = kind {
             let (folder, check) = (frames.folder(), &|| frames.check_lock());
             let written = video.write(&VideoWriter { folder, count, size, fps, job, check }, out);
-            if let Err(Stop::Interrupted) = written {
-                frames.stopped(again)?;
+            match (&written, again) {
+                (Err(Stop::Interrupted), Some(again)) => frames.stopped(again)?,
+                (Err(Stop::Interrupted), None) => {
+                    frames.remove();
+                    return written;
+                }
+                _ => {}
             }
             written?;
         }

@@ -238,13 +238,13 @@ impl Run {
         Ok(opened)
     }
 
-    /// Fails if training was stopped before its first step.
+    /// Fails if training was stopped before its first step, or the file was not copied.
     fn check_model(&self) -> Result<()> {
         if self.model_file().exists() {
             return Ok(());
         }
         let resume = format!("raygrad train --resume {}", quoted(&self.folder));
-        let what = format!("has no model yet: training has not begun. If it was stopped, resume it with `{resume}`");
+        let what = format!("has no model.safetensors; `{resume}` writes it, from the last checkpoint if there is one");
         Err(Error::file(&self.folder, what))
     }
 

@@ -38,8 +38,9 @@ pub use config::changed;
 /// How often a run that has diverged goes back to its last checkpoint.
 const RETREATS: u32 = 3;
 /// End of the message for a run that has used up its budget.
-const FINISHED: &str =
-    ", the end of its budget: add --steps or --budget with a larger total, from the start of the run, to train on";
+const FINISHED: &str = ", the end of its budget: add --steps or --budget with a larger total to train on";
+/// The same if it is beyond the total that was given.
+const BEYOND: &str = ", and the total that was given is not beyond it: totals count from the start of the run";
 
 /// Options of new runs only.
 const NEW: [&str; 19] = [
@@ -69,7 +70,7 @@ const NEW: [&str; 19] = [
 /// Ctrl-C finishes the current step, saves the model and exits with code 130. A second Ctrl-C exits at once.
 /// `raygrad train --resume RUN` resumes the run.
 ///
-/// Example: raygrad train my-scene --downscale 4 --budget 10m --out my-run
+/// Example: raygrad train my-scene --budget 10m --out my-run
 #[derive(Parser)]
 pub struct Args {
     /// Capture, image folder, video or built-in scene
@@ -187,7 +188,7 @@ pub struct Args {
     /// Resume a run from its last checkpoint
     ///
     /// The run continues to the steps or budget that it was given. --steps or --budget beside --resume set a new
-    /// total, counted from the start of the run.
+    /// total, counted from the start of the run. A total that the run is beyond changes nothing.
     #[arg(long, help_heading = "Time", value_name = "RUN", conflicts_with_all = NEW)]
     resume: Option<PathBuf>,
     /// With --resume: where the images are now
@@ -456,7 +457,11 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
         run.write()?;
     }
     describe(&run, &trainer, &data, &scene)?;
-    let end = if is_over { FINISHED } else { "" };
+    let end = match (is_over, args.given()) {
+        (false, _) => "",
+        (true, None) => FINISHED,
+        (true, Some(_)) => BEYOND,
+    };
     print(&format!("resumed  at step {}{end}\n", stats.step))?;
     let preview = Preview::choose(&scene, downscale, &data, background);
     train((run, lock), trainer, budget, args, preview, listener)

@@ -18,6 +18,8 @@ use super::served::{Limits, Served};
 
 /// JPEG quality of images, 1 to 100.
 const QUALITY: u8 = 88;
+/// A message without effect, which shows pages that the connection works.
+const ALIVE: &str = r#"{"tell":"alive"}"#;
 /// Longest reason in a close frame, in bytes, below the limit of the protocol.
 const REASON: usize = 120;
 
@@ -92,7 +94,12 @@ impl Connection {
             // Browsers answer pings by themselves, also for idle pages.
             if pinged.elapsed() >= limits.idle {
                 pinged = Instant::now();
-                if !matches!(timeout(limits.patience, out.send(Message::Ping(Default::default()))).await, Ok(Ok(()))) {
+                let send = async {
+                    out.send(Message::Ping(Default::default())).await?;
+                    // Pages do not see pings.
+                    out.send(Message::Text(ALIVE.into())).await
+                };
+                if !matches!(timeout(limits.patience, send).await, Ok(Ok(()))) {
                     return None;
                 }
             }

@@ -12,7 +12,7 @@ use super::cache::{Cache, Cached};
 use super::messages::{AboutPhotograph, rows};
 use super::requests::Requests;
 use crate::eval::alignment::Appearance;
-use crate::photographs::{present, trained};
+use crate::photographs::{learned_transform, present, trained};
 use crate::run::Run;
 use crate::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
 
@@ -197,8 +197,7 @@ impl PhotoCache {
     /// Points of the scene with their colours, limited to the best ones.
     pub fn points(&self, model: &Model<f32>) -> Vec<([f32; 3], [u8; 3])> {
         // Points move with the cameras if all cameras have a learned transform.
-        let learned =
-            model.camera_optimizer.as_ref().and_then(|refine| refine.transform(&model.params)).unwrap_or_default();
+        let learned = learned_transform(model);
         let place = |(point, color): &(DVec3, [u8; 3])| (learned.point(*point).as_vec3().to_array(), *color);
         self.points.iter().map(place).collect()
     }

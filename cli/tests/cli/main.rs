@@ -722,7 +722,7 @@ fn bad_runs_are_named() {
     std::fs::write(place.path("run/model.safetensors"), &model[..model.len() / 2]).unwrap();
     place.fails("eval run", &["run/model.safetensors: not a safetensors file"]);
     std::fs::remove_file(place.path("run/model.safetensors")).unwrap();
-    place.fails("render run", &["run: has no model yet", "resume it with `raygrad train --resume run`"]);
+    place.fails("render run", &["run: has no model.safetensors; `raygrad train --resume run` writes it"]);
     assert!(!place.path("run/eval-test.json").exists() && !place.path("run/orbit").exists());
 }
 

@@ -329,7 +329,7 @@ fn video_becomes_a_dataset_of_sharp_frames() {
     let output = command(&place, "prepare walk.mp4 --out long --frames 10").env("LENGTH", "45").output().unwrap();
     let [said, notes] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
     assert!(said.contains("images   10 sharp frames from walk.mp4, one in 4.50 s\n"), "{said}");
-    assert!(notes.contains("may overlap too little for COLMAP: --frames takes more"), "{notes}");
+    assert!(notes.contains("may overlap too little for COLMAP: `raygrad prepare --frames N` takes"), "{notes}");
     complained("a folder", &run(&place, "prepare photos --out other --frames 9"), &["`frames`: is for videos"]);
     // It is a dataset, and no second one overwrites it.
     place.succeeds(&format!("train made --scene-type bounded --steps 1 {CLASSIC}"));

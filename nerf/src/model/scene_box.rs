@@ -58,7 +58,7 @@ impl SceneBox {
         if near >= 0.0 && near < far && far.is_finite() {
             return Ok(());
         }
-        let what = format!("is {near} to {far}; near must be at least 0 and less than far");
+        let what = format!("is {near} to {far}; near must be at least 0 and less than far, and far finite");
         Err(Error::setting("scene_box.near_far", what))
     }
 

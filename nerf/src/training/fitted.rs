@@ -63,6 +63,10 @@ fn trainer(model: &Model<f32>, photographs: &Arc<Dataset>) -> Result<Trainer> {
     params.freeze(|name| name != POSES);
     let state = model.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();
     trainer.model.sampler.load_state(&state)?;
+    if let Some(marching) = trainer.model.marching_mut() {
+        // The steps of the end of training.
+        marching.progress = 1.0;
+    }
     trainer.model.set_detail(model.detail());
     trainer.is_fixed = true;
     Ok(trainer)
@@ -96,7 +100,8 @@ mod tests {
         let (batch, tile) = (32, 32);
         fitting_keeps_the_model_with(ProposalConfig { batch, tile, ..ProposalConfig::default() });
         fitting_keeps_the_model_with(HierarchicalConfig { batch, tile, ..HierarchicalConfig::default() });
-        fitting_keeps_the_model_with(MarchingConfig { samples: 1024, ..MarchingConfig::default() });
+        let last_step = Some(0.25 * MarchingConfig::default().step);
+        fitting_keeps_the_model_with(MarchingConfig { samples: 1024, last_step, ..MarchingConfig::default() });
     }
 
     fn fitting_keeps_the_model_with(sampler: impl ComponentConfig<Samplers>) {
@@ -107,6 +112,7 @@ mod tests {
         let gains = model.params.get(exposure).len();
         model.params.get_mut(exposure).as_mut_slice().iter_mut().enumerate().for_each(|(i, gain)| *gain = i as f32);
         model.set_detail(0.25);
+        model.marching_mut().into_iter().for_each(|marching| marching.progress = 1.0);
         model.finish();
         let mut trainer = trainer(&model, &data).unwrap();
         trainer.step(0.0);

@@ -1,20 +1,16 @@
 //! Ranks on several machines, connected by TCP.
 
 use super::{Exchange, ExchangeError, FirstError, next_round};
+use std::convert::Infallible;
 use std::io::{self, ErrorKind, Read, Write};
-use std::net::{TcpListener, TcpStream, ToSocketAddrs};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::mpsc::{Sender, channel};
+use std::net::{Shutdown, TcpListener, TcpStream, ToSocketAddrs};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// Limits of timeouts: connections refuse 0, and clocks end.
 const SHORTEST: Duration = Duration::from_millis(1);
 const LONGEST: Duration = Duration::from_secs(1 << 30);
-
-/// Time between looks at whether a writer should give up.
-const LOOK: Duration = Duration::from_millis(50);
 
 /// Time between attempts to connect.
 const RETRY: Duration = Duration::from_millis(20);
@@ -40,39 +36,23 @@ struct Peer {
     /// To the thread that writes, so that two ranks that send much to each other do not wait for one another.
     outgoing: Option<Sender<Vec<u8>>>,
     writer: Option<JoinHandle<()>>,
-    /// Milliseconds without progress after which the writer gives up. It does not while the exchange is in use: the other
-    /// rank may be busy with a third one, and if it hangs, the reader notices.
-    patience: Arc<AtomicU64>,
-    /// That number for the end of the exchange.
-    last_patience: u64,
+    /// Ends with the writer.
+    written: Receiver<Infallible>,
+    /// How long the last messages may take at the end of the exchange. The other rank may be busy with a third one. While
+    /// the exchange is in use, writers wait without limit: if the other rank hangs, the reader notices.
+    patience: Duration,
 }
 
 impl Drop for Peer {
     /// Waits until the last messages are sent: the other rank may still need them.
     fn drop(&mut self) {
-        self.patience.store(self.last_patience, Relaxed);
         self.outgoing = None;
+        if let Err(RecvTimeoutError::Timeout) = self.written.recv_timeout(self.patience) {
+            // Ends the writer.
+            let _ = self.incoming.shutdown(Shutdown::Both);
+        }
         self.writer.take().map(JoinHandle::join);
     }
-}
-
-/// Writes a message. Waits for the other rank to read.
-fn write(stream: &mut TcpStream, mut message: &[u8], patience: &AtomicU64) -> io::Result<()> {
-    let mut moved = Instant::now();
-    while !message.is_empty() {
-        match stream.write(message) {
-            Ok(0) => return Err(ErrorKind::WriteZero.into()),
-            Ok(count) => (message, moved) = (&message[count..], Instant::now()),
-            Err(error) if error.kind() == ErrorKind::Interrupted => {}
-            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
-                if moved.elapsed().as_millis() > patience.load(Relaxed).into() {
-                    return Err(error);
-                }
-            }
-            Err(error) => return Err(error),
-        }
-    }
-    Ok(())
 }
 
 impl Tcp {
@@ -176,15 +156,16 @@ fn accept(listener: &TcpListener, rank: usize, ranks: usize) -> io::Result<(usiz
 impl Peer {
     fn new(incoming: TcpStream, timeout: Duration, ranks: usize) -> io::Result<Self> {
         incoming.set_nodelay(true)?;
-        incoming.set_write_timeout(Some(LOOK))?;
         let mut stream = incoming.try_clone()?;
         let (outgoing, messages) = channel::<Vec<u8>>();
-        let patience = Arc::new(AtomicU64::new(u64::MAX));
-        let own = patience.clone();
+        let (ends, written) = channel();
         // It ends with the sender. If the connection breaks, the reader notices.
-        let write = move || drop(messages.iter().try_for_each(|message| write(&mut stream, &message, &own)));
+        let write = move || {
+            let _ends: Sender<Infallible> = ends;
+            drop(messages.iter().try_for_each(|message| stream.write_all(&message)));
+        };
         let (outgoing, writer) = (Some(outgoing), Some(std::thread::spawn(write)));
-        let mut peer = Peer { incoming, outgoing, writer, patience, last_patience: 0 };
+        let mut peer = Peer { incoming, outgoing, writer, written, patience: Duration::ZERO };
         peer.set_timeout(timeout, ranks)?;
         Ok(peer)
     }
@@ -192,7 +173,7 @@ impl Peer {
     /// At the end the other rank has the time to read a message of each of the others.
     fn set_timeout(&mut self, timeout: Duration, ranks: usize) -> io::Result<()> {
         let timeout = timeout.clamp(SHORTEST, LONGEST);
-        self.last_patience = timeout.as_millis() as u64 * ranks as u64;
+        self.patience = timeout.saturating_mul(u32::try_from(ranks).unwrap_or(u32::MAX)).min(LONGEST);
         self.incoming.set_read_timeout(Some(timeout))
     }
 
@@ -252,7 +233,12 @@ impl Tcp {
                 _ => ExchangeError::Lost { rank, what: error.to_string() },
             })
         };
-        self.peers.iter_mut().enumerate().map(receive).collect()
+        let received = self.peers.iter_mut().enumerate().map(receive).collect::<Result<_, _>>();
+        if received.is_err() {
+            // Of a failed exchange nobody needs the last messages.
+            self.peers.iter_mut().flatten().for_each(|peer| peer.patience = peer.patience.min(after));
+        }
+        received
     }
 }
 
@@ -395,7 +381,7 @@ mod tests {
         let mut peer = TcpStream::connect(addresses[0]).unwrap();
         peer.write_all(&greeting(1, 2)).unwrap();
         peer.write_all(&[100, 0, 0, 0, 0, 0, 0, 0, 1, 2, 3]).unwrap();
-        peer.shutdown(std::net::Shutdown::Write).unwrap();
+        peer.shutdown(Shutdown::Write).unwrap();
         let mut tcp = Tcp::with_listener(0, listener, &addresses, TIMEOUT).unwrap();
         let what = "it has closed its connection".to_owned();
         assert_eq!(tcp.all_gather(&[]), Err(ExchangeError::Lost { rank: 1, what }));

@@ -19,7 +19,8 @@ impl Mlp {
     /// `skips` count from 0. The classic NeRF has depth 8 and skips `[5]`.
     ///
     /// # Panics
-    /// If `skips` has the first layer, or a layer that does not exist.
+    /// If `skips` has the first layer, or a layer that does not exist. If there is already a parameter of one of these
+    /// names; none is added then.
     #[track_caller]
     pub fn new<T: Scalar>(
         params: &mut Params<T>,
@@ -29,6 +30,7 @@ impl Mlp {
         rng: &mut (impl Rng + ?Sized),
     ) -> Self {
         assert!(skips.iter().all(|&skip| (1..depth).contains(&skip)), "skips {skips:?} of {depth} layers");
+        (0..depth).for_each(|i| params.assert_free(&format!("{name}.{i}"), &["weight", "bias"]));
         let fan_in = |i: usize| match i {
             0 => inputs,
             _ if skips.contains(&i) => inputs + width,

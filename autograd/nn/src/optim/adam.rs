@@ -19,11 +19,11 @@ use serde::{Deserialize, Serialize};
 /// squares are finite. Work runs on the current rayon pool; the result does not depend on the number of threads.
 ///
 /// For a lazy parameter ([`Params::set_lazy`]), rows without gradient are not read, as in PyTorch's `SparseAdam`. Unlike
-/// there, each row counts its own steps, and eps is corrected as in Adam. So without gradient its moments do not decay and its bias correction does not change. A row
-/// with one late gradient changes by about one learning rate. Dense Adam, whose bias correction has ended by then,
-/// changes it over the following steps too. If every row has a gradient in every step, both agree. A penalty on the
-/// whole table makes a gradient that does not consist of rows alone. A step then visits every row whose gradient is not
-/// zero.
+/// there, each row counts its own steps, and eps is corrected as in Adam. So without gradient a row's moments do not
+/// decay and its bias correction does not change. A row with one late gradient changes by about one learning rate.
+/// Dense Adam, whose bias correction has ended by then, changes it over the following steps too. If every row has a
+/// gradient in every step, both agree. A penalty on the whole table makes a gradient that does not consist of rows
+/// alone. A step then visits every row whose gradient is not zero.
 #[derive(Debug, Clone)]
 pub struct Adam<T: Scalar> {
     /// Group 0 has the parameters of no other group.

@@ -1,7 +1,7 @@
 //! What a store of parameters does.
 
 use super::*;
-use crate::{Init, LayerNorm, Linear, Optimizer, Sgd, SgdConfig, Storage, Tiles};
+use crate::{Init, LayerNorm, Linear, Mlp, Optimizer, Sgd, SgdConfig, Storage, Tiles};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use raygrad_autograd::Activation;
@@ -163,6 +163,12 @@ fn layers_with_a_taken_name_add_nothing() {
         }
         assert_eq!(params.len(), 1);
     }
+    let mut params = Params::<f32>::new();
+    params.add("net.2.bias", Tensor::scalar(1.0));
+    let rng = &mut StdRng::seed_from_u64(1);
+    let mlp = || drop(Mlp::new(&mut params, "net", [2, 3, 4], &[], rng));
+    assert_eq!(panic_of(mlp), "there is already a parameter `net.2.bias`");
+    assert_eq!(params.len(), 1);
 }
 
 #[test]

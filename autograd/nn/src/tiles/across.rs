@@ -125,8 +125,7 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
     }
 }
 
-/// A number for the names and shapes of the parameters that are not frozen (FNV-1a). Frames have 32 bits for it on any
-/// machine.
+/// A number for the names and shapes of the parameters that are not frozen (FNV-1a), of 32 bits on any machine.
 fn fingerprint<T: Scalar>(params: &Params<T>) -> usize {
     let described = params.trainable().map(|id| format!("{} {:?}\n", params.name(id), params.get(id).shape()));
     let bytes = described.flat_map(String::into_bytes);

@@ -50,9 +50,9 @@ function connect() {
   address.protocol = address.protocol.replace("http", "ws");
   const own = socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
-  socket.onopen = () => { attempts = 0; $("lost").hidden = true; unseen = null; };
+  socket.onopen = () => { attempts = 0; $("lost").hidden = true; unseen = null; lastHeard = performance.now(); };
   socket.onmessage = (event) => {
-    heard = performance.now();
+    lastHeard = performance.now();
     return typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data);
   };
   socket.onclose = async (event) => {
@@ -71,24 +71,24 @@ function connect() {
   };
 }
 
-/** Time of the last message, in milliseconds, and the longest silence before the page asks if raygrad is there. */
-let heard = 0;
-const SILENCE = 10000;
+/** Time of the last message. raygrad sends one at least every five seconds, but a large image may take long. */
+let lastHeard = 0;
+/** The silence in milliseconds after which the page asks if raygrad is there, and after which the connection is dead. */
+const QUIET = 15000, DEAD = 60000;
 
 // A network that comes back from sleep loses connections without closing them.
 async function probe() {
-  const isSilent = () => unseen !== null && performance.now() - Math.max(heard, unseen) > SILENCE;
-  if (document.hidden || socket.readyState !== WebSocket.OPEN || !isSilent()) return;
-  try {
-    await fetch(withToken("access"), { signal: AbortSignal.timeout(3000) });
-  } catch {
-    if (!isSilent()) return;
-    $("lost").textContent = "raygrad does not respond. Reconnecting…";
-    $("lost").hidden = false;
-    connect();
-  }
+  const silence = () => performance.now() - lastHeard;
+  if (document.hidden || socket.readyState !== WebSocket.OPEN || silence() < QUIET) return;
+  const own = socket;
+  const isThere = await fetch(withToken("access"), { signal: AbortSignal.timeout(3000) }).then(() => true, () => false);
+  if (socket !== own || silence() < (isThere ? DEAD : QUIET)) return;
+  $("lost").textContent = "raygrad does not respond. Reconnecting…";
+  $("lost").hidden = false;
+  socket.close();
+  connect();
 }
-setInterval(probe, SILENCE / 2);
+setInterval(probe, 5000);
 
 // A new link, opened in the same tab.
 addEventListener("hashchange", () => {
@@ -869,7 +869,7 @@ document.addEventListener("visibilitychange", () => {
   say({ ask: "rest" });
 });
 listen(stage);
-new ResizeObserver(() => { if (about) { layout(); ask(); } }).observe(stage);
+new ResizeObserver(() => { if (about && stage.clientHeight) { layout(); ask(); } }).observe(stage);
 
 takeToken();
 connect();

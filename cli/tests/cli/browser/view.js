@@ -740,6 +740,21 @@ brought = (data) => heard.push(data.byteLength);
 socket.onmessage({ data: '{"tell":"x"}' });
 socket.onmessage({ data: new ArrayBuffer(3) });
 is("heard", heard, [{ tell: "x" }, 3]);
+/** Requests, new sockets and calls of a probe after this silence, with raygrad within reach or not. */
+const probed = async (silence, isThere) => {
+  [clock, verdict] = [lastHeard + silence, isThere ? 204 : null];
+  const [asked, opened] = [fetched.length, made.length];
+  Object.assign(socket, { readyState: 1, close: () => calls.push("closed") });
+  await probe();
+  return [fetched.length - asked, made.length - opened, called()];
+};
+fixed(document, "hidden", false);
+called();
+is("a short silence", await probed(14000, false), [0, 0, []]);
+is("a long message", await probed(20000, true), [1, 0, []]);
+is("out of reach", await probed(20000, false), [1, 1, ["closed"]]);
+is("a dead connection", [await probed(61000, true), $("lost").hidden], [[1, 1, ["closed"]], false]);
+verdict = 204;
 
 // ---- a new link in the same tab -----------------------------------------------------------------------------------------
 const [first, old] = [token, socket];
