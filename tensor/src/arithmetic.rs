@@ -85,7 +85,7 @@ macro_rules! operator {
         impl $trait<&Tensor<$t>> for $t {
             type Output = Tensor<$t>;
             fn $method(self, other: &Tensor<$t>) -> Tensor<$t> {
-                &Tensor::scalar(self) $op other
+                map([&Tensor::scalar(self), other], &other.pool(), #[inline(always)] |[a, b]| a $op b)
             }
         }
         impl $trait<Tensor<$t>> for $t {

@@ -98,7 +98,8 @@ impl From<i32> for Axes {
 
 impl From<usize> for Axes {
     fn from(axis: usize) -> Self {
-        Axes::from([axis as isize])
+        // No tensor has the largest axis.
+        Axes::from([isize::try_from(axis).unwrap_or(isize::MAX)])
     }
 }
 
@@ -172,6 +173,11 @@ impl Reduction {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn axes_beyond_the_largest_number_do_not_exist() {
+        assert!(Axes::from(usize::MAX).find(&[2, 3]).is_err());
+    }
 
     #[test]
     fn axes_count_from_either_end() {

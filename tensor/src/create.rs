@@ -64,13 +64,23 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     pub fn linspace(start: T, end: T, count: usize) -> Self {
         let (first, last, most) = (start.to_f64(), end.to_f64(), count.saturating_sub(1).max(1) as f64);
-        // From the nearer end, so that both are exact.
+        let step = last - first;
+        // From the nearer end, so that both are exact and numbers never turn back.
         let at = |i: usize| {
             let (part, rest) = (i as f64 / most, (most - i as f64) / most);
-            // Of both ends, so that no difference overflows.
-            if part <= 0.5 { first * (1.0 - part) + last * part } else { last * (1.0 - rest) + first * rest }
+            match (step.is_finite(), part <= 0.5) {
+                (true, true) => first + step * part,
+                (true, false) => last - step * rest,
+                // Of both ends, as their difference overflows.
+                (false, true) => first * (1.0 - part) + last * part,
+                (false, false) => last * (1.0 - rest) + first * rest,
+            }
         };
-        Tensor::from_fn(&[count], |i| T::from_f64(at(i)))
+        Tensor::from_fn(&[count], |i| match i {
+            0 => start,
+            i if i + 1 == count => end,
+            i => T::from_f64(at(i)),
+        })
     }
 
     /// The identity matrix `[n, n]`.
@@ -184,6 +194,20 @@ impl<T: Scalar> From<&Indices> for Tensor<T> {
 mod tests {
     use super::*;
     use crate::s;
+
+    #[test]
+    fn linspace_stays_between_its_ends_and_never_turns_back() {
+        for (start, end) in
+            [(0.1, 0.1), (0.3, 0.3), (0.1, 0.1 + f64::EPSILON), (0.7, -0.1), (-1e308, 1.7e308), (1.0, 2.0)]
+        {
+            for count in 2..60 {
+                let all = Tensor::linspace(start, end, count).to_vec();
+                let turns = all.windows(2).any(|pair| if start <= end { pair[0] > pair[1] } else { pair[0] < pair[1] });
+                assert!(!turns && all[0] == start && all[count - 1] == end, "{start} {end} {all:?}");
+            }
+        }
+        assert_eq!(Tensor::linspace(0.0, f64::INFINITY, 1), Tensor::from([0.0]));
+    }
 
     #[test]
     #[should_panic(expected = "concat along axis 0 to a tensor that is too large")]

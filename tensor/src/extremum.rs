@@ -77,8 +77,8 @@ fn along<T: Scalar>(x: &[T], [outer, count, inner]: Middle, first: usize, out: &
     );
 }
 
-/// The gradient of [`extremum`]: `g` of each result `y`, shared evenly among the elements equal to `y`. If `y` is NaN,
-/// all get 0.
+/// The gradient of [`extremum`]: `g` of each result `y`, shared evenly among the elements equal to `y`, fewer than 2^32.
+/// If `y` is NaN, all get 0.
 ///
 /// # Panics
 /// If the lengths do not fit.

@@ -96,7 +96,7 @@ const PER_OPERATION: usize = 8;
 /// depth, and runs on all threads.
 ///
 /// Sums run in the order of the underlying kernel. It depends on the sizes and on the processor's instruction set, but
-/// never on the number of threads. Sums of over 8192 terms in a small product are split, and their parts are added in
+/// never on the number of threads. Sums of 8192 terms or more in a small product are split, and their parts are added in
 /// pairs.
 ///
 /// # Panics
@@ -177,6 +177,10 @@ pub fn matmul<T: Scalar>(a: &Tensor<T>, b: &Tensor<T>, pool: &Pool<T>) -> Tensor
     let with = |last: [usize; 2]| lead.iter().copied().chain(last).collect::<Shape>();
     let layouts = [a.layout().stretched(&with([m, k])), b.layout().stretched(&with([k, n]))];
     pool.filled(&with([m, n]), |c| {
+        // The leading axes of an empty product may be larger than memory.
+        if c.is_empty() {
+            return;
+        }
         let ([a_at, b_at], work) =
             (layouts.each_ref().map(|x| x.offsets(lead.len())), m.saturating_mul(k).saturating_mul(n));
         let one = |i: usize, c: &mut [T]| {
@@ -221,6 +225,12 @@ unsafe fn product<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: *mut T, row:
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    #[test]
+    fn empty_products_of_any_leading_extent_are_immediate() {
+        let a = Tensor::<f32>::zeros(&[1 << 40, 0, 3]);
+        assert_eq!(matmul(&a, &Tensor::zeros(&[3, 4]), &Pool::none()).shape(), [1 << 40, 0, 4]);
+    }
 
     fn naive(a: &[f64], b: &[f64], [m, k, n]: [usize; 3]) -> Vec<f64> {
         let at = |i: usize, j: usize| (0..k).map(|l| a[i * k + l] * b[l * n + j]).sum();

@@ -42,8 +42,8 @@ impl<T: Scalar> Tensor<T> {
         assert!(start.is_finite() && end.is_finite(), "uniform numbers from {start} to {end}");
         Tensor::from_fn(shape, |_| {
             let part = unit::<T>(rng);
-            // Of both ends, so that no difference overflows.
-            T::from_f64(start * (1.0 - part) + end * part)
+            // Of both ends, so that no difference overflows. Rounding may lead out of a short range.
+            T::from_f64((start * (1.0 - part) + end * part).clamp(start.min(end), start.max(end)))
         })
     }
 
@@ -99,6 +99,16 @@ mod tests {
     use super::*;
     use rand::SeedableRng;
     use rand::rngs::StdRng;
+
+    #[test]
+    fn uniform_numbers_of_a_short_range_are_within_it() {
+        let rng = &mut StdRng::seed_from_u64(1);
+        let a = 1.0 / 3.0;
+        for end in [a, a + f64::EPSILON] {
+            let all = Tensor::<f64>::uniform(&[1000], a..end, rng);
+            assert!(all.as_slice().iter().all(|x| (a..=end).contains(x)));
+        }
+    }
 
     /// The largest distance between the distribution of some numbers and the expected one, in units of the distance
     /// expected by chance. A value beyond 1.95 comes once in a thousand draws (Kolmogorov and Smirnov).

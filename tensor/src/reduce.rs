@@ -212,7 +212,8 @@ pub fn sum_axes<T: Scalar>(x: &Tensor<T>, axes: &[usize], pool: &Pool<T>) -> Ten
 }
 
 /// Sums over the axes along which `shape` broadcasts to the shape of `x`: the adjoint of [`Tensor::broadcast_to`]. A
-/// view is summed without a copy. Along broadcast axes the sum is a product, and permuted axes take no extra time.
+/// permuted or broadcast view is summed without a copy; of other views, such as slices, the copy is dropped. Along
+/// broadcast axes the sum is a product, and permuted axes take no extra time.
 ///
 /// # Panics
 /// If `shape` does not broadcast to the shape of `x`.
@@ -305,7 +306,8 @@ fn sum_kept<T: Scalar>(x: &Tensor<T>, kept: &[usize], pool: &Pool<T>) -> Tensor<
         let times = T::from_f64(times as f64);
         return map([&sum], pool, |[sum]| sum * times).broadcast_to(kept);
     }
-    let Some(order) = layout.memory_order() else { return sum_packed(x, kept, pool) };
+    // Another view, whose packed copy is dropped with it.
+    let Some(order) = layout.memory_order() else { return sum_packed(&x.with_layout(layout), kept, pool) };
     let turned: Shape = order.iter().map(|&axis| kept[axis]).collect();
     let sum = sum_packed(&x.with_layout(layout.permuted(&order)), &turned, pool);
     sum.with_layout(sum.layout().permuted(&inverse(&order)))

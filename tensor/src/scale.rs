@@ -13,7 +13,7 @@ pub fn power_of_two(exponent: i64) -> f64 {
 }
 
 /// The exponent of a number: n for 2^n and numbers up to twice as large, below those of all products for 0, -1023 for
-/// subnormal numbers, 1024 for infinity and NaN.
+/// subnormal numbers of f64, 1024 for infinity and NaN.
 pub fn exponent<T: Scalar>(x: T) -> i64 {
     if x == T::ZERO { -10_000 } else { (x.to_f64().to_bits() >> 52 & 0x7ff) as i64 - 1023 }
 }

@@ -7,6 +7,7 @@
 //! `RAYGRAD_SIMD` caps the choice, for tests and measurements. `scalar` selects the plain fallback, `v3` at most AVX2 +
 //! FMA, and `v4` (the default) the best available. It is read once, at the first call.
 
+use std::env::VarError;
 use std::sync::OnceLock;
 
 use pulp::Arch;
@@ -91,7 +92,8 @@ pub fn check_environment() -> Result<(), String> {
 
 fn from_environment() -> Result<Arch, String> {
     match std::env::var("RAYGRAD_SIMD") {
-        Err(_) => Ok(Arch::new()),
+        Err(VarError::NotPresent) => Ok(Arch::new()),
+        Err(VarError::NotUnicode(cap)) => Err(format!("RAYGRAD_SIMD is {cap:?}: set it to scalar, v3 or v4")),
         Ok(cap) => capped(&cap).ok_or_else(|| format!("RAYGRAD_SIMD is {cap:?}: set it to scalar, v3 or v4")),
     }
 }

@@ -210,7 +210,9 @@ impl<T: Scalar> Tensor<T> {
         let pool = self.pool();
         let mut values = pool.take(self.len());
         view.layout.read(self.buffer(), &mut values);
-        &view.packed.get_or_init(|| Buffer { values, home: pool.home() }).values
+        // The buffer that is dropped returns to the pool.
+        let buffer = Buffer { values, home: pool.home() };
+        &view.packed.get_or_init(|| buffer).values
     }
 
     /// The elements in row-major order, for writing. It copies the elements first if another tensor shares them, or if
@@ -294,13 +296,12 @@ impl<T: Scalar> Tensor<T> {
     /// Converts the elements to another number type, rounded to nearest.
     pub fn cast<U: Scalar>(&self) -> Tensor<U> {
         // A view stays a view: repeated elements are converted once.
-        let values = self.buffer().iter().map(|&x| U::from_f64(x.to_f64())).collect();
+        let cast = |values: &[T]| values.iter().map(|&x| U::from_f64(x.to_f64())).collect();
         match &self.view {
-            None => Tensor::from_vec(&self.shape, values),
-            Some(view) if view.layout.len() >= self.buffer().len() => Tensor::strided(values, view.layout.clone()),
-            Some(_) => {
-                Tensor::from_vec(&self.shape, self.as_slice().iter().map(|&x| U::from_f64(x.to_f64())).collect())
+            Some(view) if view.layout.len() >= self.buffer().len() => {
+                Tensor::strided(cast(self.buffer()), view.layout.clone())
             }
+            _ => Tensor::from_vec(&self.shape, cast(self.as_slice())),
         }
     }
 

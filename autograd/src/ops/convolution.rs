@@ -133,9 +133,9 @@ impl Sizes {
         pool.tensor(&[if self.windows.are_pixels() { 0 } else { self.rows * self.count }])
     }
 
-    /// Image `i` unfolded, in `scratch` if needed.
-    fn unfolded<'a, T: Scalar>(&self, x: &'a Tensor<T>, i: usize, scratch: &'a mut Tensor<T>) -> Matrix<'a, T> {
-        let image = &x.as_slice()[i * self.image..][..self.image];
+    /// Image `i` unfolded, in `scratch` if needed. `x` are all images: each task would copy a view.
+    fn unfolded<'a, T: Scalar>(&self, x: &'a [T], i: usize, scratch: &'a mut Tensor<T>) -> Matrix<'a, T> {
+        let image = &x[i * self.image..][..self.image];
         if self.windows.are_pixels() {
             return Matrix::new(image, self.rows, self.count);
         }
@@ -144,8 +144,8 @@ impl Sizes {
     }
 
     /// The output or its gradient for image `i`, as a matrix of channels and windows.
-    fn output<'a, T: Scalar>(&self, g: &'a Tensor<T>, i: usize) -> Matrix<'a, T> {
-        Matrix::new(&g.as_slice()[i * self.o * self.count..][..self.o * self.count], self.o, self.count)
+    fn output<'a, T: Scalar>(&self, g: &'a [T], i: usize) -> Matrix<'a, T> {
+        Matrix::new(&g[i * self.o * self.count..][..self.o * self.count], self.o, self.count)
     }
 }
 
@@ -175,7 +175,7 @@ impl<T: Scalar> Op<T> for Conv2d {
         let s = Sizes::new(&self.0, x[0].shape(), x[1].shape());
         let [oh, ow] = s.windows.output();
         let mut y = pool.tensor(&[s.n, s.o, oh, ow]);
-        let weight = Matrix::new(x[1].as_slice(), s.o, s.rows);
+        let (images, weight) = (x[0].as_slice(), Matrix::new(x[1].as_slice(), s.o, s.rows));
         let product = |unfolded: Matrix<'_, T>, y: &mut [T]| {
             if let Some(bias) = x.get(2) {
                 y.chunks_exact_mut(unfolded.columns()).zip(bias.as_slice()).for_each(|(y, &b)| y.fill(b));
@@ -184,14 +184,14 @@ impl<T: Scalar> Op<T> for Conv2d {
         };
         let image = |[scratch, part]: &mut [Tensor<T>; 2], i: usize, y: &mut [T]| {
             if part.is_empty() {
-                return product(s.unfolded(x[0], i, scratch), y);
+                return product(s.unfolded(images, i, scratch), y);
             }
             for start in (0..oh).step_by(s.strip()) {
                 let rows = start..oh.min(start + s.strip());
                 let count = rows.len() * ow;
                 let (unfolded, part) =
                     (&mut scratch.as_mut_slice()[..s.rows * count], &mut part.as_mut_slice()[..s.o * count]);
-                s.windows.unfold_rows(&x[0].as_slice()[i * s.image..][..s.image], rows, unfolded);
+                s.windows.unfold_rows(&images[i * s.image..][..s.image], rows, unfolded);
                 product(Matrix::new(unfolded, s.rows, count), part);
                 let strips = y.chunks_exact_mut(s.count).map(|y| &mut y[start * ow..][..count]);
                 strips.zip(part.chunks_exact(count)).for_each(|(y, part)| y.copy_from_slice(part));
@@ -243,12 +243,12 @@ impl<T: Scalar> Op<T> for Conv2dInput {
         let shape = [x[0].shape()[0], x[1].shape()[1], self.image[0], self.image[1]];
         let s = Sizes::new(&self.config, &shape, x[1].shape());
         let mut out = pool.tensor(&shape);
-        let weight = Matrix::new(x[1].as_slice(), s.o, s.rows).t();
+        let (g, weight) = (x[0].as_slice(), Matrix::new(x[1].as_slice(), s.o, s.rows).t());
         let image = |scratch: &mut Tensor<T>, i: usize, image: &mut [T]| {
             if s.windows.are_pixels() {
-                return gemm(weight, s.output(x[0], i), image, false);
+                return gemm(weight, s.output(g, i), image, false);
             }
-            gemm(weight, s.output(x[0], i), scratch.as_mut_slice(), false);
+            gemm(weight, s.output(g, i), scratch.as_mut_slice(), false);
             image.fill(T::ZERO);
             s.windows.fold(scratch.as_slice(), image);
         };
@@ -288,10 +288,11 @@ impl<T: Scalar> Op<T> for Conv2dWeight {
             return out;
         }
         let mut sums = pool.tensor(&[slots, len]);
+        let (images, g) = (x[0].as_slice(), x[1].as_slice());
         let slot = |scratch: &mut Tensor<T>, slot: usize, sum: &mut [T]| {
             let first = slot * s.n / slots;
             for i in first..(slot + 1) * s.n / slots {
-                gemm(s.output(x[1], i), s.unfolded(x[0], i, scratch).t(), sum, i > first);
+                gemm(s.output(g, i), s.unfolded(images, i, scratch).t(), sum, i > first);
             }
         };
         chunks(sums.as_mut_slice(), len, s.work(), || s.scratch(pool), &slot);

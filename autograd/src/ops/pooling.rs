@@ -98,7 +98,9 @@ fn planes<T: Scalar>(
 ) -> Tensor<T> {
     let mut out = pool.tensor(shape);
     let (from, to) = (plane_len(x.shape()), plane_len(shape));
-    let each = |_: &mut (), i: usize, out: &mut [T]| f(&x.as_slice()[i * from..][..from], out);
+    // Each task would copy a view.
+    let x = x.as_slice();
+    let each = |_: &mut (), i: usize, out: &mut [T]| f(&x[i * from..][..from], out);
     chunks(out.as_mut_slice(), to, 2 * x.len().max(shape.iter().product()), || (), &each);
     out
 }
@@ -133,8 +135,9 @@ impl MaxPool2d {
         let windows = self.0.accepted(x.shape());
         let (from, to) = (plane_len(x.shape()), windows.count());
         let mut index = vec![0; x.len() / from * to];
+        let x = x.as_slice();
         let each = |best: &mut Vec<T>, i: usize, out: &mut [u32]| {
-            windows.arg_maxima(&x.as_slice()[i * from..][..from], best, out);
+            windows.arg_maxima(&x[i * from..][..from], best, out);
         };
         chunks(&mut index, to, 4 * x.len(), || vec![T::ZERO; to], &each);
         Indices::new(&[x.len() / from, to], index)

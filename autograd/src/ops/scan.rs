@@ -79,6 +79,10 @@ pub(super) fn walk_rows<S: Copy>(
     mut f: impl FnMut(&mut S, usize),
 ) {
     let mut states = vec![start; inner];
+    // Without columns there may be any number of rows.
+    if inner == 0 {
+        return;
+    }
     for rows in ranges {
         states.fill(start);
         for step in 0..rows.len() {

@@ -239,7 +239,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// Normalises the rows of the last axis to length 1. Rows of any size keep their digits (1e-40 and 1e30 alike).
     ///
     /// A row of zeros gives zeros, with gradient 0. Where the gradient of a tiny row would overflow, it is the largest
-    /// finite number. A row with NaN or an infinite element gives NaN.
+    /// finite number. A row with NaN gives NaN. In a row with an infinite element, such elements give NaN and
+    /// others 0, as in PyTorch; the gradient is NaN.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

@@ -102,6 +102,13 @@ fn scans<T: Scalar>(shape: [usize; 3]) {
 }
 
 #[test]
+fn scans_without_columns_are_immediate() {
+    let tape = Tape::<f32>::new();
+    let x = tape.leaf(Tensor::zeros(&[1 << 40, 1, 0]));
+    assert_eq!([x.cumsum(1), x.cumprod(1)].map(|y| y.shape().to_vec()), [[1 << 40, 1, 0]; 2]);
+}
+
+#[test]
 fn scans_of_lines_side_by_side() {
     for outer in [1, 2, 7, 8, 9, 15, 16, 17, 29] {
         for count in [1, 2, 33, 300] {
