@@ -449,7 +449,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     let is_over = watch::remaining(budget, &stats).0 >= 1.0;
     run.config.raygrad = env!("CARGO_PKG_VERSION").to_owned();
     run.config.keep_checkpoints = args.keep_checkpoints.unwrap_or(run.config.keep_checkpoints);
-    // A total that the run is beyond has no effect, and a later --resume goes on to the old one.
+    // A total that the run is beyond has no effect, so a later --resume continues to the old one.
     if !is_over {
         run.config.budget = Some(budget);
     }

@@ -262,6 +262,12 @@ impl<T: Scalar> Model<T> {
         errors.reduce(|sum, error| sum + error).unwrap_or_else(|| params.tape().constant(Tensor::scalar(T::ZERO)))
     }
 
+    /// Copies the state of the sampler of a model with the same configuration.
+    pub(crate) fn copy_sampler_state<U: Scalar>(&mut self, other: &Model<U>) -> Result<()> {
+        let state = other.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();
+        self.sampler.load_state(&state)
+    }
+
     /// Converts the model to another precision, with the same samples, occupied cells and (rounded) parameters.
     ///
     /// # Errors
@@ -272,8 +278,7 @@ impl<T: Scalar> Model<T> {
         model.params.assign(&self.params);
         (model.appearance_image, model.vignetted) = (self.appearance_image, self.vignetted);
         model.set_detail(self.detail);
-        let state = self.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();
-        model.sampler.load_state(&state)?;
+        model.copy_sampler_state(self)?;
         if let (Some(old), Some(new)) = (self.marching(), model.marching_mut()) {
             *new = old.clone();
         }

@@ -61,8 +61,7 @@ fn trainer(model: &Model<f32>, photographs: &Arc<Dataset>) -> Result<Trainer> {
         *params.get_mut(id) = if is_common { known.clone() } else { mean_rows(known, &shape) };
     }
     params.freeze(|name| name != POSES);
-    let state = model.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();
-    trainer.model.sampler.load_state(&state)?;
+    trainer.model.copy_sampler_state(model)?;
     if let Some(marching) = trainer.model.marching_mut() {
         // The steps of the end of training.
         marching.progress = 1.0;

@@ -78,6 +78,22 @@ fn cone_steps_grow_and_tend_to_uniform() {
             near_by(total, exact);
         }
     }
+    // Five roundings of at most a unit each; the grid of numbers is odd, so that all of them are rounded.
+    let mut worst = 0.0;
+    for draw in 0..400_u16 {
+        let part = |k: f64| (f64::from(draw) * k).fract() as f32;
+        let (length, cone, near) = (0.005 + 0.01 * part(0.618), 0.01 + 0.2 * part(0.414), 0.5 + 4.0 * part(0.732));
+        let out = march([near.into(), f64::from(near) + 20.0], Step { length, cone, max_samples: usize::MAX });
+        let [length, c, near] = [length, cone, near].map(f64::from);
+        let start = near + 0.5 * (length + c * near);
+        for (i, &t) in out.t.iter().enumerate() {
+            let exact = start + (length + c * start) * (i as f64 * c.ln_1p()).exp_m1() / c;
+            let error = (f64::from(t) - exact).abs() / ulp::<f32>(exact);
+            assert!(error <= 5.0, "{error} ULP: {length} {c} {near}, sample {i}");
+            worst = error.max(worst);
+        }
+    }
+    println!("worst of drawn steps: {worst:.2} ULP");
     let [uniform, narrow] = [0.0, 1e-9].map(|cone| march([0.0, 8.0], Step { length: 0.01, cone, max_samples: 10_000 }));
     assert_eq!(uniform.t.len(), narrow.t.len());
     for (i, (a, b)) in uniform.t.iter().zip(&narrow.t).enumerate() {

@@ -31,7 +31,7 @@ thread_local! {
 ///
 /// A rank that hangs while it sends a message ends the job at once, after a line on standard error: MPI cannot give
 /// the buffers of such messages back. A rank that hangs elsewhere is an [error](ExchangeError::TimedOut). If it
-/// goes on after the others have given up, it finds that they receive nothing, and ends the job too.
+/// continues after the others have given up, it finds that they receive nothing, and ends the job too.
 #[derive(Debug)]
 pub struct Mpi {
     rank: usize,

@@ -340,7 +340,7 @@ mod tests {
     /// Rank 2 reads the message of rank 0, which takes longer than the timeout, before that of rank 1.
     #[test]
     fn messages_wait_for_ranks_that_are_busy_with_others() {
-        let timeout = Duration::from_millis(500);
+        let timeout = Duration::from_millis(800);
         let listeners: Vec<_> = (0..3).map(|_| TcpListener::bind("127.0.0.1:0").unwrap()).collect();
         let addresses: Vec<_> = listeners.iter().map(|listener| listener.local_addr().unwrap()).collect();
         let mut listeners = listeners.into_iter();
@@ -349,14 +349,15 @@ mod tests {
             let mut streams: Vec<_> =
                 (0..2).map(|_| retry(Instant::now() + TIMEOUT, || accept(&slow, 0, 3)).unwrap()).collect();
             for (_, stream) in &mut streams {
-                stream.write_all(&4_u64.to_le_bytes()).unwrap();
+                stream.write_all(&9_u64.to_le_bytes()).unwrap();
             }
-            for _ in 0..4 {
+            // Two writes that time out have made some progress, so a timeout would end the third.
+            for _ in 0..9 {
                 for (rank, stream) in &mut streams {
-                    if *rank == 1 { stream.write_all(&[0; 4]).unwrap() } else { stream.write_all(&[0]).unwrap() }
+                    if *rank == 1 { stream.write_all(&[0; 9]).unwrap() } else { stream.write_all(&[0]).unwrap() }
                 }
                 streams.retain(|(rank, _)| *rank == 2);
-                std::thread::sleep(Duration::from_millis(300));
+                std::thread::sleep(timeout / 2);
             }
             std::thread::sleep(TIMEOUT / 20);
         });
@@ -365,7 +366,10 @@ mod tests {
             std::thread::spawn(move || {
                 let mut tcp = Tcp::with_listener(i + 1, listener, &addresses, timeout).unwrap();
                 let part = vec![1; if i == 0 { 20_000_000 } else { 0 }];
-                tcp.all_to_all(&[&[], &part, &part]).map(|parts| parts[1].len())
+                let length = tcp.all_to_all(&[&[], &part, &part]).map(|parts| parts[1].len());
+                // The exchange is still in use.
+                std::thread::sleep(5 * timeout);
+                length
             })
         });
         let lengths: Vec<_> = ranks.collect::<Vec<_>>().into_iter().map(|rank| rank.join().unwrap()).collect();

@@ -7,6 +7,7 @@ use raygrad_autograd::{ReadSparse, SparseParts, Var};
 use raygrad_tensor::Scalar;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::iter::Peekable;
 use std::ops::Range;
 
@@ -125,11 +126,11 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
     }
 }
 
-/// A number for the names and shapes of the parameters that are not frozen (FNV-1a), of 32 bits on any machine.
+/// A hash of the names and shapes of the parameters that are not frozen.
 fn fingerprint<T: Scalar>(params: &Params<T>) -> usize {
-    let described = params.trainable().map(|id| format!("{} {:?}\n", params.name(id), params.get(id).shape()));
-    let bytes = described.flat_map(String::into_bytes);
-    bytes.fold(0x811c_9dc5_u32, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193)) as usize
+    let mut hasher = DefaultHasher::new();
+    params.trainable().for_each(|id| (params.name(id), params.get(id).shape()).hash(&mut hasher));
+    hasher.finish() as usize
 }
 
 /// The tiles of a rank.

@@ -159,7 +159,7 @@ function meet(message) {
   bounds = about.bounds;
   if (elsewhere) recall();
   overlaid = requested = null;
-  // A video that goes on says so.
+  // A video that continues sends its progress.
   $("video-progress").hidden = $("end-video").hidden = true;
   document.title = `${about.title} - raygrad`;
   $("title").textContent = about.title;

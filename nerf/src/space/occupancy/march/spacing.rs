@@ -15,8 +15,8 @@ const SPARE: usize = 2 * LANES;
 ///
 /// At distance `t` a step is `length + cone t` long. Sample `i` of a ray that enters at `near` is at
 /// `t_i = t_0 + (length + cone t_0) ((1 + cone)^i - 1) / cone`, with `t_0 = near + jitter (length + cone near)`. For a
-/// cone of 0 this is `t_0 + i length`. Each is computed directly from `i`, so within 1 ULP, or 3 with a cone, for any
-/// `i`.
+/// cone of 0 this is `t_0 + i length`. Each is computed directly from `i`, so within 1 ULP, or 5 with a cone (its
+/// factors are rounded too), for any `i`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Step {
