@@ -289,7 +289,14 @@ fn core() -> Vec<Entry> {
         Entry::new(sum(&[3, 1], false)).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
         Entry::new(sum(&[], true)).linear().sample(&[&[2, 3]]).sample(&[&[]]),
         Entry::new(sum(&[3, 1], true)).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
-        Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]) }).linear().sample(&[&[3, 1]]).sample(&[&[]]),
+        Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]), mean: false })
+            .linear()
+            .sample(&[&[3, 1]])
+            .sample(&[&[]]),
+        Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]), mean: true })
+            .linear()
+            .sample(&[&[3, 1]])
+            .sample(&[&[]]),
         Entry::new(shape::Reshape { shape: shape(&[3, 2]) }).linear().sample(&[&[2, 3]]).sample(&[&[6]]),
         Entry::new(shape::Concat { axis: 1 }).linear().sample(&[&[2, 3], &[2, 1], &[2, 0]]).sample(&[&[2, 3]]),
         Entry::new(segment::SegmentSum(segments())).linear().sample(&[&[7]]).sample(&[&[7, 2]]),

@@ -104,7 +104,8 @@ fn directions(x: &[Tensor<f64>], which: usize, most: usize) -> Vec<(Vec<Tensor<f
         (along(d), size)
     };
     let random = |k: usize| {
-        let d = spread(x.shape(), &[-1.0..1.0], 13 * k + which + 5);
+        let mut d = spread(x.shape(), &[-1.0..1.0], 13 * k + which + 5);
+        d.as_mut_slice().iter_mut().zip(x.iter()).for_each(|(d, x)| *d *= x.abs().max(1.0));
         let size = norm(&d) / (d.len() as f64).sqrt();
         (along(d), size)
     };

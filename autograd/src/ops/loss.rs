@@ -305,17 +305,17 @@ impl<T: Scalar, F: ElementLoss> Op<T> for MeanLoss<F> {
         let [least, up] = if size_of::<T>() == 4 { [-126, 100] } else { [-1022, 900] }.map(power_of_two);
         let share = g / n;
         if g.item() == T::ZERO || !(share.item().abs() < T::from_f64(least)) {
-            return Grads::new([Some(share.broadcast_to(shape)), None, None]);
+            return Grads::new([Some(g.spread_to(shape)), None, None]);
         }
         // Of variables on the same tape, or on one of its own. On the same, as new nodes: one may depend on the other.
         let [a, b] = [1, 2].map(|i| cx.x(i));
         let [da, db] = if cx.recording() {
             let [a, b] = [a, b].map(|x| Alias.on([&x.tracked()]));
-            gradients(self.0, [&a, &b], g.clone(), [up, n])
+            gradients(self.0, [&a, &b], g.clone(), up)
         } else {
             let tape = cx.tape().nested();
             let [a, b] = [a, b].map(|x| tape.leaf(x.value().clone()));
-            let grads = gradients(self.0, [&a, &b], tape.constant(g.value().clone()), [up, n]);
+            let grads = gradients(self.0, [&a, &b], tape.constant(g.value().clone()), up);
             grads.map(|grad| cx.constant(grad.into_value()))
         };
         Grads::new([None, Some(da), Some(db)])
@@ -326,15 +326,10 @@ impl<T: Scalar, F: ElementLoss> Op<T> for MeanLoss<F> {
     }
 }
 
-/// The gradients of the operands of a mean of `n` losses, from `up` times the gradient of each.
-fn gradients<'t, T: Scalar, F: Formula<2>>(
-    loss: F,
-    x: [&Var<'t, T>; 2],
-    g: Var<'t, T>,
-    [up, n]: [f64; 2],
-) -> [Var<'t, T>; 2] {
+/// The gradients of the operands of a mean of losses, from `up` times the gradient of each.
+fn gradients<'t, T: Scalar, F: Formula<2>>(loss: F, x: [&Var<'t, T>; 2], g: Var<'t, T>, up: f64) -> [Var<'t, T>; 2] {
     let y = loss.on(x);
-    let g = (g * up / n).broadcast_to(y.shape());
+    let g = (g * up).spread_to(y.shape());
     let mut grads = y.vjp(&g, &x).into_iter().map(|grad| grad / up);
     [(); 2].map(|()| match grads.next() {
         Some(grad) => grad,
@@ -382,7 +377,7 @@ impl<T: Scalar> Op<T> for MeanCrossEntropy {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let shape = cx.shape(0);
-        Grads::new([Some((cx.g() / shape.iter().product::<usize>() as f64).broadcast_to(shape)), None])
+        Grads::new([Some(cx.g().spread_to(shape)), None])
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {

@@ -116,10 +116,11 @@ fn middle<'t, T: Scalar>(x: &Var<'t, T>, kept: &[usize], pool: &Pool<T>) -> Opti
     let [down, _] = scales(x.value(), kept, pool);
     // `scales` ends at 2^-100 and 2^100, or 2^-1000 and 2^1000.
     let end = power_of_two(if size_of::<T>() == 4 { 90 } else { 990 });
+    // Sums of deviations, and their products with the number of elements, stay in range.
+    let of_large = power_of_two(-9 - i64::from(x.value().len().max(1).ilog2()));
     let factor = |down: T| match down.to_f64() {
         up if up > end => down,
-        // Sums of some deviations stay in range, and small elements keep their digits.
-        down if down < 1.0 / end => T::from_f64(power_of_two(-8)),
+        down if down < 1.0 / end => T::from_f64(of_large),
         _ => T::ONE,
     };
     let factor = down.map(factor);
@@ -160,12 +161,12 @@ impl<T: Scalar> Op<T> for Norm {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (x, y) = (cx.x(0), cx.y());
         let quotient = |x: &Var<'t, T>, y: &Var<'t, T>| Grads::one(Ratio.on([cx.g(), x, &unless_zero(y)]));
-        // A length that is a subnormal number has lost digits.
+        // A length that is a subnormal number has lost digits, and one that overflows has lost all.
         let least = if size_of::<T>() == 4 { f32::MIN_POSITIVE.into() } else { f64::MIN_POSITIVE };
-        if y.value().iter().all(|y| y.to_f64() >= least) {
+        if y.value().iter().all(|y| (least..f64::INFINITY).contains(&y.to_f64())) {
             return quotient(&x, &y);
         }
-        match middle(&x, &self.shape, cx.pool()).map(|factor| factor.maximum(1.0)) {
+        match middle(&x, &self.shape, cx.pool()) {
             None => quotient(&x, &y),
             Some(factor) => {
                 let x = x * factor;

@@ -2,7 +2,7 @@
 
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::Reduction;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, mean_to, sum_to};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, map, mean_to, sum_to};
 
 /// y = x summed over the axes along which `shape` broadcasts to the shape of x; dx = g broadcast. The mean is the sum
 /// divided by the number of summands, and so is its gradient. The mean overflows only if the mean itself does.
@@ -38,21 +38,23 @@ impl<T: Scalar> Op<T> for SumTo {
         if !self.mean {
             return Grads::one(cx.g().broadcast_to(cx.shape(0)));
         }
-        let [from, to] = [cx.shape(0), &self.shape].map(|shape| shape.iter().product::<usize>() as f64);
-        Grads::one((cx.g() / (from / to)).broadcast_to(cx.shape(0)))
+        Grads::one(cx.g().spread_to(cx.shape(0)))
     }
 }
 
-/// y = x broadcast to `shape`; dx = g summed over the broadcast axes.
+/// y = x broadcast to `shape`; dx = g summed over the broadcast axes. The adjoint of the mean divides x by the number of
+/// copies, and its own gradient is a mean.
 #[derive(Clone)]
 pub struct BroadcastTo {
     /// The shape of the output.
     pub shape: Shape,
+    /// Divides by the number of copies.
+    pub mean: bool,
 }
 
 impl<T: Scalar> Op<T> for BroadcastTo {
     fn name(&self) -> &'static str {
-        "broadcast_to"
+        if self.mean { "spread_to" } else { "broadcast_to" }
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
@@ -62,8 +64,13 @@ impl<T: Scalar> Op<T> for BroadcastTo {
         }
     }
 
-    fn forward(&self, x: &[&Tensor<T>], _pool: &Pool<T>) -> Tensor<T> {
-        x[0].broadcast_to(&self.shape)
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        if !self.mean {
+            return x[0].broadcast_to(&self.shape);
+        }
+        let [from, to] = [&self.shape, x[0].shape()].map(|shape| shape.iter().product::<usize>() as f64);
+        let copies = T::from_f64(from / to);
+        map([x[0]], pool, |[x]| x / copies).broadcast_to(&self.shape)
     }
 
     fn reads(&self) -> Reads {
@@ -71,7 +78,8 @@ impl<T: Scalar> Op<T> for BroadcastTo {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(cx.g().sum_to(cx.shape(0)))
+        let g = cx.g();
+        Grads::one(if self.mean { g.mean_to(cx.shape(0)) } else { g.sum_to(cx.shape(0)) })
     }
 }
 
@@ -154,6 +162,11 @@ impl<'t, T: Scalar> Var<'t, T> {
         if self.shape() == shape {
             return self.clone();
         }
-        self.tape().apply(BroadcastTo { shape: shape.into() }, &[self])
+        self.tape().apply(BroadcastTo { shape: shape.into(), mean: false }, &[self])
+    }
+
+    /// Broadcasts shares: this tensor divided by the number of its copies. The adjoint of the mean.
+    pub(crate) fn spread_to(&self, shape: &[usize]) -> Self {
+        self.tape().apply(BroadcastTo { shape: shape.into(), mean: true }, &[self])
     }
 }

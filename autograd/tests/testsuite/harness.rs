@@ -1,7 +1,7 @@
 //! The gradient checker is checked: each way in which an operation can be wrong is caught, by the check that is meant
 //! to catch it.
 
-use raygrad_autograd::check::{Cases, Check, Entry, Extreme, check_op};
+use raygrad_autograd::check::{Cases, Check, Entry, Extreme, check_function, check_op};
 use raygrad_autograd::{Elementwise, Formula, Grads, Op, Pool, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::{broadcast_shape, map};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -211,4 +211,38 @@ fn exact_checks_catch_tiny_faults() {
     let by = "the output along a gradient against the input along its adjoint";
     assert_caught(&Entry::new(Elementwise(Thrice)).linear().sample(&[&[2, 3]]), by);
     assert_eq!(verdict(&Entry::new(Elementwise(Thrice)).sample(&[&[2, 3]])), Ok(()));
+}
+
+/// y = x^2, with a gradient that is off by a thousandth.
+#[derive(Clone)]
+struct RoughSquare;
+
+impl<T: Scalar> Op<T> for RoughSquare {
+    fn name(&self) -> &'static str {
+        "rough_square"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        Ok(Shape::from(x[0]))
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        map([x[0]], pool, |[x]| x * x)
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        Grads::one(cx.g() * cx.x(0) * 2.002)
+    }
+}
+
+/// With few elements and with many, whose directions are drawn, the step follows the size of the numbers.
+#[test]
+fn faults_at_large_numbers_are_caught() {
+    for n in [6, 60] {
+        let x = Tensor::from_fn(&[n], |i| 1e5 + i as f64);
+        let report =
+            check_function(&Check::default(), std::slice::from_ref(&x), |x| x[0].tape().apply(RoughSquare, &[&x[0]]));
+        assert!(report.is_err(), "{n}: {report:?}");
+        check_function(&Check::default(), &[x], |x| &x[0] * &x[0]).unwrap();
+    }
 }

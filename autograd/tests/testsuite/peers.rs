@@ -27,10 +27,11 @@ macro_rules! cases {
 }
 
 /// Operations of the catalogue without a reference, and why.
-const WITHOUT: [(&str, &str); 18] = [
+const WITHOUT: [(&str, &str); 19] = [
     ("alias", "the tape's own copy of an input, not callable from outside; it is the identity"),
     ("mul_add", "the exact sum of a product in recorded gradients, not callable from outside; tests of those cover it"),
     ("ratio", "part of the gradients of norm, var and std, not callable from outside; tests of their range cover it"),
+    ("spread_to", "the gradient of mean, compared as such, not callable from outside"),
     ("cosine", "part of recorded gradients of hypot, not callable from outside; tests of those cover it"),
     ("logistic_density", "the same of sigmoid and tanh"),
     ("cumprod_grad", "compared as the gradient of cumprod"),

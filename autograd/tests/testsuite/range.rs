@@ -2,6 +2,7 @@
 //! their second derivatives.
 
 use proptest::prelude::*;
+use raygrad_autograd::derivatives::jvp;
 use raygrad_autograd::{Axes, Pool2dConfig, Scalar, Segments, Tape, Tensor, Var};
 use std::ops::{Add, Mul, Sub};
 
@@ -686,6 +687,75 @@ fn deviation_of_numbers_whose_squares_overflow() {
         for (got, expected) in grad.iter().zip([-0.335_410_2_f32, -0.111_803_4, 0.111_803_4, 0.335_410_2]) {
             assert!((got / expected - 1.0).abs() < 2e-7, "{grad:?}");
         }
+    }
+}
+
+/// Many numbers at the end of the range, of which sums and products with their count leave it.
+#[test]
+fn long_rows_at_the_end_of_the_range() {
+    fn check<T: Scalar>(most: f64) {
+        let (most, tape) = (T::from_f64(most), Tape::<T>::new());
+        let near = |got: T, expected: f64| (got.to_f64() / expected - 1.0).abs() < 8.0 * T::EPSILON;
+        let n = 1024;
+        let x = tape.leaf(Tensor::from_fn(&[n], |i| if i % 2 == 0 { most } else { -most }));
+        let y = x.std(0);
+        let share = 1.0 / n as f64;
+        let third = Tensor::from_fn(&[n], |i| if i == 3 { T::ONE } else { T::ZERO });
+        assert!(near(along(&|x| x[0].std(0), x.value(), &third), -share));
+        for grad in [y.grad(&[&x]).remove(0), y.grad_graph(&[&x]).remove(0).into_value()] {
+            let mut signs = [share, -share].into_iter().cycle();
+            assert!(grad.iter().all(|got| near(got, signs.next().unwrap())), "{:?}", grad.as_slice()[0]);
+        }
+        // A mean in the direction of numbers whose sum is not in range, and that of losses.
+        let direction = Tensor::full(&[4], most);
+        let ones = Tensor::full(&[4], T::ONE);
+        assert!(near(along(&|x| x[0].mean(), &ones, &direction), most.to_f64()));
+        let half = Tensor::full(&[4], T::from_f64(0.5));
+        let l1 = along(&|x| x[0].l1_loss(x[0].tape().constant(half.clone())), &ones, &direction);
+        assert!(near(l1, most.to_f64()));
+        // Gradients of gain and bias whose sums come back into range.
+        let x = tape.constant(Tensor::from_fn(&[4, 2], |i| T::from_f64((i % 2) as f64)));
+        let (gain, bias) = (tape.leaf(Tensor::full(&[2], T::ONE)), tape.leaf(Tensor::zeros(&[2])));
+        for (weights, of_bias) in [([1.0, 1.0, -1.0, -1.0], 0.0), ([1.0, 1.0, -1.0, -0.5], 0.5)] {
+            let weights = weights.map(|weight| T::from_f64(0.9 * weight) * most);
+            let weights =
+                tape.constant(Tensor::from_fn(&[4, 2], |i| if i % 2 == 0 { weights[i / 2] } else { T::ZERO }));
+            let loss = (x.layer_norm(&gain, &bias, 0.0) * &weights).sum();
+            let recorded = loss.grad_graph(&[&gain, &bias]).into_iter().map(Var::into_value).collect::<Vec<_>>();
+            for grads in [loss.grad(&[&gain, &bias]), recorded] {
+                let expected = 0.9 * of_bias * most.to_f64();
+                let [gain, bias] = [&grads[0], &grads[1]].map(|grad| grad.as_slice());
+                for (got, expected) in [(gain[0], -expected), (gain[1], 0.0), (bias[0], expected), (bias[1], 0.0)] {
+                    assert!(got.to_f64() == expected || near(got, expected), "{got:?} for {expected}");
+                }
+            }
+        }
+        // A length that overflows still has a direction.
+        let x = tape.leaf(Tensor::from([most, most]));
+        assert!(x.norm().item().to_f64().is_infinite());
+        for grad in [x.norm().grad(&[&x]).remove(0), x.norm().grad_graph(&[&x]).remove(0).into_value()] {
+            assert!(grad.iter().all(|got| near(got, 0.5_f64.sqrt())), "{grad:?}");
+        }
+    }
+    check::<f32>(3e38);
+    check::<f64>(1.7e308);
+}
+
+/// The derivative of a function of one operand in a direction.
+fn along<T: Scalar>(f: &dyn for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &Tensor<T>, direction: &Tensor<T>) -> T {
+    jvp(f, std::slice::from_ref(x), std::slice::from_ref(direction)).1.item()
+}
+
+/// NaN in one row changes nothing in others, which have digits only if a large gradient lifts them.
+#[test]
+fn nan_stays_in_its_row_of_a_softmax() {
+    let tape = Tape::<f32>::new();
+    let x = tape.leaf(Tensor::from([[0_f32, 0.0], [0.0, -100.0]]));
+    for nan in [f32::NAN, 1.0] {
+        let g = tape.constant(Tensor::from([[nan, 1.0], [0.0, 1e30]]));
+        let y = x.softmax(-1);
+        let grad = tape.no_grad(|| y.vjp(&g, &[&x])).remove(0);
+        assert!((grad.value().as_slice()[3] / 3.720_076e-14 - 1.0).abs() < 1e-6, "{:?}", grad.value());
     }
 }
 

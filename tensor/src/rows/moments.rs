@@ -275,12 +275,35 @@ pub fn layer_norm_rows_grad<T: Scalar>(
             },
         );
         if let Some([dgain, dbias]) = sums {
-            let total = |j: usize| parts.iter().map(|(_, sums)| sums[j]).sum::<f64>();
-            dgain.iter_mut().chain(dbias).enumerate().for_each(|(j, out)| *out = T::from_f64(total(j)));
+            let mut totals: Vec<f64> = (0..2 * n).map(|j| parts.iter().map(|(_, sums)| sums[j]).sum()).collect();
+            if !totals.iter().all(|total| total.is_finite()) {
+                let again = sums_in_range(x, n, g, eps);
+                totals.iter_mut().zip(again).filter(|(total, _)| !total.is_finite()).for_each(|(out, sum)| *out = sum);
+            }
+            dgain.iter_mut().chain(dbias).zip(totals).for_each(|(out, total)| *out = T::from_f64(total));
         }
     } else if let Some([dgain, dbias]) = sums {
         dgain.iter_mut().chain(dbias).for_each(|out| *out = T::ZERO);
     }
+}
+
+/// The gradients of gain and bias, one after the other, where sums on the way leave the range of the type.
+#[cold]
+#[inline(never)]
+fn sums_in_range<T: Scalar>(x: &[T], n: usize, g: &[T], eps: f64) -> Vec<f64> {
+    /// The exponent by which the summands are smaller.
+    const DOWN: i64 = -64;
+    let (down, mut sums) = (wide_power::<T>(DOWN), vec![0.0; 2 * n]);
+    for (x, g) in x.chunks_exact(n).zip(g.chunks_exact(n)) {
+        let Scaled { apart, scale, .. } = Scaled::new(x, eps);
+        let (of_gain, of_bias) = sums.split_at_mut(n);
+        for i in 0..n {
+            let g = g[i].wide() * down;
+            of_gain[i] += (g * apart[i].wide() * scale).narrow().to_f64();
+            of_bias[i] += g.narrow().to_f64();
+        }
+    }
+    sums.into_iter().map(|sum| sum * power_of_two(-DOWN)).collect()
 }
 
 /// One part of [`layer_norm_rows_grad`]; `sums`, of gain and bias, may be empty.

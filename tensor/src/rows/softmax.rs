@@ -233,7 +233,8 @@ pub fn softmax_rows_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], n: usize, out: &m
                     #[inline(always)]
                     |a, b| if b.abs() > a.abs() { b } else { a },
                 );
-                let may_lift = largest.abs() > T::ONE;
+                // It may also be NaN, of another row.
+                let may_lift = !(largest.abs() <= T::ONE);
                 let rows = y.chunks_exact(n).zip(g.chunks_exact(n)).zip(out.chunks_exact_mut(n));
                 for (i, ((y, g), out)) in rows.enumerate() {
                     let [mean] = totals_of(

@@ -173,6 +173,7 @@ fn drawn_near(may_be_far: bool, mut draw: impl FnMut() -> f64) -> f64 {
 /// The errors of second derivatives, with one column for each pair of operands and each operand's derivative by `g`.
 fn examine<T: Scalar>(operation: &Operation<T>, seconds: &Seconds, far: Far, cases: usize) -> Vec<Column> {
     let (format, n) = (Format::of::<T>(), operation.operands);
+    let least = 2.0_f64.powi(format.least as i32);
     // The value's column, which `report` expects first, is not measured.
     let mut columns = vec![Column::default(); 1 + n * (n + 1)];
     columns[0].count = cases;
@@ -213,8 +214,12 @@ fn examine<T: Scalar>(operation: &Operation<T>, seconds: &Seconds, far: Far, cas
             }
             let exact = of.iter().map(|&(second, term)| (g * h * second, g * h * term));
             for (j, (exact, term)) in exact.chain([(h * slope, h * term)]).enumerate() {
-                if exact.is_finite() && !exact.is_zero() && exact.exponent() >= format.least {
-                    let error = format.error(got[j].value().as_slice()[i].to_f64(), exact, term);
+                let value = got[j].value().as_slice()[i].to_f64();
+                let is_tiny = exact.is_zero() || exact.exponent() < format.least;
+                // Of numbers that underflow, digits do not count; nor do terms that cancel beyond the range.
+                let cancels = exact.is_zero() && !term.is_zero() && term.exponent() > format.greatest;
+                if exact.is_finite() && !cancels && !(is_tiny && value.abs() <= 4.0 * least) {
+                    let error = format.error(value, exact, term);
                     let at = || x.iter().copied().chain([drawn[i].3, drawn[i].4]).collect();
                     columns[1 + k * (n + 1) + j].add(error, LIMIT, at);
                 }
