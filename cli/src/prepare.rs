@@ -5,12 +5,13 @@ mod bounds;
 mod cameras;
 pub mod convert;
 mod exif;
-mod heif;
+mod foreign;
 mod pairs;
 mod photographs;
 mod poses;
 pub mod program;
 mod root;
+mod tone;
 mod undistort;
 mod video;
 mod workplace;
@@ -24,7 +25,7 @@ use raygrad::nerf::dataset::Capture;
 use super::interrupt::Work;
 use super::output::{complain, listed, note, print, quoted};
 use super::parse;
-use super::scene::{Scene, assumptions};
+use super::scene::{CaptureArgs, Scene, assumptions};
 use super::shard::Shard;
 use super::{builtin, doctor, interrupt};
 use convert::{Conversion, Target};
@@ -189,7 +190,9 @@ fn prepare(args: &Args) -> Work<()> {
     make(&Input { path: input, frames: frames.unwrap_or(FRAMES), lens, allow_outside }, out)?;
     // The dataset is complete, so errors of the check are only warnings.
     let (scene, out) = (Scene::Folder(out.clone()), out.join("doctor"));
-    if let Err(error) = doctor::run(&doctor::Args { scene, scene_type: None, out, overwrite: false, json: false }) {
+    let capture = CaptureArgs::default();
+    let check = doctor::Args { scene, capture, compare: None, out, overwrite: false, json: false };
+    if let Err(error) = doctor::run(&check) {
         complain(&format!("warning: {error}"));
     }
     Ok(())

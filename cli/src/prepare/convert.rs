@@ -261,6 +261,9 @@ pub fn merge(complete: Complete) -> Work<()> {
         }
         remove_temporary(&dataset)?;
         rename_durable(&dataset, &out)?;
+    } else if !out.exists() {
+        let what = "is missing, as is what it would become: remove the folder around it and run all shards again";
+        return Err(Error::file(&dataset, what).into());
     }
     shard::clear(&at);
     let images = complete.whole.items;

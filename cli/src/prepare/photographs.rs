@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::dataset::{Photo, copy_upright};
 use raygrad::nerf::{Error, Result};
 
-use super::heif::Heif;
+use super::foreign::Foreign;
 use super::root::Root;
 use super::workplace::Workplace;
 use crate::interrupt::Work;
@@ -15,47 +15,50 @@ use crate::output::complain;
 use crate::progress::Progress;
 
 /// File extensions of images that raygrad reads.
-const READ: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
+const READ: [&str; 9] = ["png", "jpg", "jpeg", "webp", "jfif", "jpe", "tif", "tiff", "bmp"];
 /// File extensions of images that other programs convert; the content decides.
-const CONVERTED: [&str; 4] = ["heic", "heif", "hif", "avif"];
+const CONVERTED: [&str; 5] = ["heic", "heif", "hif", "avif", "exr"];
 /// File extensions of images that raygrad does not read.
-const NOT_READ: [&str; 8] = ["tif", "tiff", "exr", "dng", "cr2", "cr3", "nef", "arw"];
+const NOT_READ: [&str; 9] = ["dng", "cr2", "cr3", "nef", "arw", "orf", "raf", "rw2", "gif"];
 
-/// Copies the images `found` in a folder to `images`. Applies their EXIF orientation, and converts HEIC and AVIF to
-/// JPEG. `outside` allows links to other folders.
+/// Copies the images `found` in a folder to `images`. Applies their EXIF orientation, and converts HEIC, AVIF
+/// and those of high dynamic range to JPEG. `outside` allows links to other folders.
 pub fn copy(folder: &Path, found: &[PathBuf], outside: bool, place: &Workplace) -> Work<usize> {
     if !outside {
         let root = Root::new(folder)?;
         found.iter().try_for_each(|path| root.check(path)).map_err(|what| Error::file(folder, what))?;
     }
-    let heif = Heif::find(found)?;
-    let (to, names) = (place.make("images")?, names(found)?);
+    let foreign = Foreign::find(found)?;
+    let (to, names) = (place.make("images")?, names(found, &foreign)?);
     let costs: Vec<u64> =
-        decoding_memory(found).into_iter().zip(heif.memory()).map(|(own, other)| own.max(other)).collect();
+        decoding_memory(found).into_iter().zip(foreign.memory()).map(|(own, other)| own.max(other)).collect();
     Progress::new().each(&costs, "images copied", |i| {
         let to = to.join(&names[i]);
-        if heif.convert(i, &found[i], &to, place)? { Ok(()) } else { Ok(copy_upright(&found[i], &to)?) }
+        if foreign.convert(i, &found[i], &to, place)? { Ok(()) } else { Ok(copy_upright(&found[i], &to)?) }
     })?;
     Ok(found.len())
 }
 
-/// The names of the copies: those of the images, but `.jpg` for HEIC and AVIF, or `.heic.jpg` beside an image with that
-/// name.
-fn names(found: &[PathBuf]) -> Result<Vec<PathBuf>> {
+/// The names of the copies: those of the images, but `.jpg` for converted ones, or `.heic.jpg` and the like beside an
+/// image with that name.
+fn names(found: &[PathBuf], foreign: &Foreign) -> Result<Vec<PathBuf>> {
+    /// Endings of JPEG files.
+    const JPEG: [&str; 4] = ["jpg", "jpeg", "jfif", "jpe"];
     let lower = |name: &Path| name.to_string_lossy().to_lowercase();
     let own = |path: &PathBuf| PathBuf::from(path.file_name().unwrap_or_default());
+    let is_renamed = |i: usize| ends(&found[i], &CONVERTED) || foreign.contains(i) && !ends(&found[i], &JPEG);
     let mut taken: HashSet<String> =
-        found.iter().filter(|path| !ends(path, &CONVERTED)).map(|path| lower(&own(path))).collect();
-    let name = |path: &PathBuf| {
+        (0..found.len()).filter(|i| !is_renamed(*i)).map(|i| lower(&own(&found[i]))).collect();
+    let name = |(i, path): (usize, &PathBuf)| {
         let own = own(path);
-        if !ends(path, &CONVERTED) {
+        if !is_renamed(i) {
             return Ok(own);
         }
         let long = PathBuf::from([own.as_os_str(), OsStr::new(".jpg")].join(OsStr::new("")));
         let free = [own.with_extension("jpg"), long].into_iter().find(|name| taken.insert(lower(name)));
         free.ok_or_else(|| Error::file(path, "would replace another image as JPEG: rename it"))
     };
-    found.iter().map(name).collect()
+    found.iter().enumerate().map(name).collect()
 }
 
 /// Bytes of memory while each image is decoded; 0 if its header cannot be read, as decoding reports the error.
@@ -110,7 +113,7 @@ fn images(folder: &Path) -> (Vec<PathBuf>, usize) {
 /// cannot read, and names the other folders.
 pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
     let unreadable = |count: usize| {
-        format!("{count} images are TIFF, EXR or raw, which raygrad cannot read: convert them to JPEG or PNG")
+        format!("{count} images are raw or GIF, which raygrad cannot read: convert them to JPEG, PNG or TIFF")
     };
     let all: Vec<_> = places(folder).map(|place| (images(&place), place)).collect();
     let best = all.iter().rev().max_by_key(|((found, _), _)| found.len());
@@ -118,7 +121,7 @@ pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
         if let Some(((_, unread), place)) = all.iter().find(|((_, unread), _)| *unread > 0) {
             return Err(Error::file(place, unreadable(*unread)));
         }
-        let what = "holds no images: put .jpg, .png, .webp or .heic files in it or in its folder `images`";
+        let what = "holds no images: put .jpg, .png, .tif, .webp or .heic files in it or in its folder `images`";
         return Err(Error::file(folder, what));
     };
     if *unread > 0 {

@@ -8,6 +8,7 @@ use raygrad::nerf::dataset::Photo;
 
 use super::photographs::{decoding_memory, ends};
 use super::program::{FFMPEG, file_url};
+use super::tone::{self, TO_JPEG};
 use super::workplace::Workplace;
 use crate::interrupt::Work;
 use crate::output::{complain, entries};
@@ -32,8 +33,6 @@ const MATRICES: [(&str, &str); 7] = [
 ];
 /// Transfer curves of HDR: their tags in ffmpeg's output, and their usual names.
 const HDR: [(&str, &str); 2] = [("arib-std-b67", "HLG"), ("smpte2084", "PQ")];
-/// The filter that ends with the YUV of JPEG files: BT.601 with full range.
-const TO_JPEG: &str = "scale=out_color_matrix=bt601:out_range=full";
 
 /// Properties of a video from ffmpeg.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -116,18 +115,13 @@ impl Video {
         let Video { matrix, hdr, .. } = *self;
         let plain = format!("{TO_JPEG}:in_color_matrix={matrix}");
         let Some((transfer, name)) = hdr else { return Ok(plain) };
-        let filters = FFMPEG.ask(&["-hide_banner", "-filters"])?;
-        if !["zscale", "tonemap"].iter().all(|wanted| filters.split_whitespace().any(|word| word == *wanted)) {
+        if !tone::can_map()? {
             let what = "this ffmpeg lacks the filter zscale, so colours will be flat; record without HDR, or install an \
                         ffmpeg with zimg";
             complain(&format!("warning: the video is HDR ({name}): {what}"));
             return Ok(plain);
         }
-        // 203 cd/m2 are the white of ITU-R BT.2408. Mobius keeps values below 0.7, and compresses up to 1015 cd/m2.
-        Ok(format!(
-            "zscale=tin={transfer}:min=bt2020nc:pin=bt2020:t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,\
-             tonemap=mobius:param=0.7:desat=0:peak=5,zscale=t=iec61966-2-1,format=gbrp,{TO_JPEG}"
-        ))
+        Ok(tone::map(&format!("tin={transfer}:min=bt2020nc:pin=bt2020")))
     }
 }
 

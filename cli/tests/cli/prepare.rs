@@ -161,7 +161,7 @@ fn run(place: &Place, arguments: &str) -> Output {
 const BLOCKS: [[u8; 3]; 8] =
     [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255], [0, 0, 0], [32, 176, 64], [200, 90, 30], [128, 128, 128]];
 
-/// Encodes a second of [`BLOCKS`] without loss to `name`, through ffmpeg filters, with tags of the stream.
+/// Encodes a second of [`BLOCKS`] without loss to a video or image, through ffmpeg filters, with tags of the stream.
 fn record(place: &Place, name: &str, [width, height]: [usize; 2], filters: &str, tags: &str) {
     let pixel = |i: usize| BLOCKS[i % width * BLOCKS.len() / width];
     let frame: Vec<u8> = (0..width * height).flat_map(pixel).collect();
@@ -169,7 +169,11 @@ fn record(place: &Place, name: &str, [width, height]: [usize; 2], filters: &str,
     let size = format!("{width}x{height}");
     let mut ffmpeg = Command::new("ffmpeg");
     ffmpeg.args(["-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-r", "3", "-s", &size, "-i"]);
-    ffmpeg.arg(place.path("raw")).args(["-vf", filters, "-c:v", "ffv1"]);
+    ffmpeg.arg(place.path("raw")).args(["-vf", filters]);
+    match name.ends_with(".mkv") {
+        true => ffmpeg.args(["-c:v", "ffv1"]),
+        false => ffmpeg.args(["-frames:v", "1", "-update", "1"]),
+    };
     let output = ffmpeg.args(tags.split_whitespace()).arg(place.path(name)).output().unwrap();
     assert!(output.status.success(), "{name}: {output:?}");
 }
@@ -178,8 +182,14 @@ fn record(place: &Place, name: &str, [width, height]: [usize; 2], filters: &str,
 fn color_error(place: &Place, name: &str, blocks: &[usize]) -> f32 {
     let output = command(place, &format!("prepare {name} --out made --frames 3")).output().unwrap();
     assert!(output.status.success(), "{output:?}");
-    let frame = Photo::open(place.path("made/images/frame_00001.jpg"), None).unwrap();
+    let error = color_error_of(&place.path("made/images/frame_00001.jpg"), blocks);
     std::fs::remove_dir_all(place.path("made")).unwrap();
+    error
+}
+
+/// The same of an image.
+fn color_error_of(image: &std::path::Path, blocks: &[usize]) -> f32 {
+    let frame = Photo::open(image, None).unwrap();
     let error = |block: usize| {
         let seen = frame.pixel((2 * block + 1) * frame.width / (2 * BLOCKS.len()), frame.height / 2);
         let apart = BLOCKS[block].iter().zip(seen).map(|(own, seen)| (255.0 * seen - f32::from(*own)).abs());
@@ -242,6 +252,62 @@ fn hdr_frames_become_srgb() {
         assert!(error <= 5.0, "{transfer}: {error}");
         std::fs::remove_file(place.path("hdr.mkv")).unwrap();
     }
+}
+
+/// A PNG file with the chunk `cICP`.
+fn with_codes(png: &[u8], primaries: u8, transfer: u8) -> Vec<u8> {
+    let data = [b"cICP", &[primaries, transfer, 0, 1][..]].concat();
+    let chunk = [&[0, 0, 0, 4], &data[..], &crc32fast::hash(&data).to_be_bytes()].concat();
+    // The signature and the chunk `IHDR`.
+    [&png[..33], &chunk, &png[33..]].concat()
+}
+
+#[test]
+fn images_of_high_range_become_srgb() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let place = place_with_ffmpeg();
+    let lacks = Command::new("ffmpeg").args(["-hide_banner", "-filters"]).output().unwrap().stdout;
+    if !String::from_utf8_lossy(&lacks).contains(" zscale ") {
+        return skipped("ffmpeg has no filter zscale");
+    }
+    let input = "zscale=tin=iec61966-2-1:pin=bt709:min=gbr:rin=full:npl=203";
+    let filters = format!("{input}:t=linear:p=bt709:m=gbr:r=full,format=gbrpf32le");
+    record(&place, "photos/linear.exr", [160, 80], &filters, "");
+    for (name, transfer, code) in [("pq", "smpte2084", 16), ("hlg", "arib-std-b67", 18)] {
+        for (primaries, number) in [("bt2020", 9), ("smpte432", 12)] {
+            let path = format!("photos/{name}-{primaries}.png");
+            let filters = format!("{input}:t={transfer}:p={primaries}:m=gbr:r=full,format=rgb48be");
+            record(&place, &path, [160, 80], &filters, "");
+            let png = std::fs::read(place.path(&path)).unwrap();
+            std::fs::write(place.path(&path), with_codes(&png, number, code)).unwrap();
+        }
+    }
+    // Another image has the name of the copy.
+    std::fs::write(place.path("photos/PQ-bt2020.jpg"), jpeg(4, 1)).unwrap();
+    let output = run(&place, "prepare photos --out made");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let expected = "note: 5 images of high dynamic range become sRGB: values up to 0.7 of white stay, those up to 5 \
+                    times white are compressed\n";
+    assert!(said.contains(expected), "{said}");
+    for name in ["linear", "pq-bt2020.png", "pq-smpte432", "hlg-bt2020", "hlg-smpte432"] {
+        // Colours that tone mapping keeps up to a hundredth: black and the mixed ones.
+        let error = color_error_of(&place.path(&format!("made/images/{name}.jpg")), &[4, 5, 7]);
+        assert!(error <= 7.0, "{name}: {error}");
+    }
+    assert!(!place.path("made/images/linear.exr").exists());
+    assert_eq!(place.bytes("made/images/PQ-bt2020.jpg"), jpeg(4, 1));
+    // Without the filter, and without ffmpeg.
+    std::fs::remove_file(place.path("bin/ffmpeg")).unwrap();
+    let expected =
+        ["photos/hlg-bt2020.png: is EXR or HDR PNG, which ffmpeg reads: install it with `apt install ffmpeg`"];
+    complained("no ffmpeg", &run(&place, "prepare photos --out other"), &expected);
+    std::fs::write(place.path("bin/ffmpeg"), CONVERTER).unwrap();
+    std::fs::set_permissions(place.path("bin/ffmpeg"), std::fs::Permissions::from_mode(0o755)).unwrap();
+    let expected = ["is EXR or HDR PNG, which this ffmpeg cannot map to sRGB: install one with the filter zscale"];
+    complained("no filter", &run(&place, "prepare photos --out other"), &expected);
 }
 
 /// The script in place of ffmpeg has no filters.
@@ -474,13 +540,13 @@ fn bad_inputs_are_named() {
     complained_of(
         "empty",
         &run(&place, "prepare empty --out made"),
-        "empty: holds no images: put .jpg, .png, .webp or .heic files in it or in its folder `images`",
+        "empty: holds no images: put .jpg, .png, .tif, .webp or .heic files in it or in its folder `images`",
     );
-    std::fs::write(place.path("empty/0.TIFF"), "").unwrap();
+    std::fs::write(place.path("empty/0.DNG"), "").unwrap();
     complained_of(
         "tiff",
         &run(&place, "prepare empty --out made"),
-        "empty: 1 images are TIFF, EXR or raw, which raygrad cannot read: convert them to JPEG or PNG",
+        "empty: 1 images are raw or GIF, which raygrad cannot read: convert them to JPEG, PNG or TIFF",
     );
     complained("no cameras", &run(&place, "prepare photos --out made --to colmap"), &["photos: is not a dataset"]);
     complained_of("a file", &run(&place, "prepare photos --out walk.mp4"), "walk.mp4: is not a folder");
@@ -743,7 +809,7 @@ fn heic_images_become_upright_jpegs() {
         let output = command(&place, "prepare photos --out made").env("SEVERAL", several).output().unwrap();
         assert!(output.status.success(), "{output:?}");
         for name in ["0.heic", "5.HEIC", "6.jpg"] {
-            assert!(ran(&place, &["/heif-", program, &format!("/photos/{name}"), " 0.jpg"]), "{}", log(&place));
+            assert!(ran(&place, &["/foreign-", program, &format!("/photos/{name}"), " 0.jpg"]), "{}", log(&place));
         }
         assert!(!ran(&place, &[program, "7.heic"]) && !ran(&place, &[program, "0.JPG"]));
         let mut names: Vec<_> = std::fs::read_dir(place.path("made/images")).unwrap().collect();
@@ -758,7 +824,7 @@ fn heic_images_become_upright_jpegs() {
         // raygrad itself turns this one.
         assert_eq!(Photo::size_of_file(place.path("made/images/7.jpg")).unwrap(), [[8, 16]; 2]);
         let left = std::fs::read_dir(place.path("made")).unwrap().map(|entry| entry.unwrap().file_name());
-        assert!(left.into_iter().all(|name| !name.to_str().unwrap().starts_with("heif")));
+        assert!(left.into_iter().all(|name| !name.to_str().unwrap().starts_with("foreign")));
     }
 }
 

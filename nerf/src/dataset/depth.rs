@@ -18,16 +18,9 @@ use std::path::Path;
 /// Returns distances along the rays through the camera's pixel centres, in scene units; 0 where nothing was measured.
 /// Other sizes are resampled by nearest neighbour: an average of a near and a far depth would be wrong.
 pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image> {
-    let wrong = |what: String| Error::file(path, what);
     let ([width, height], depths) = decoded(path)?;
+    check_shape(path, [width, height], camera)?;
     let Camera { width: columns, height: rows, .. } = *camera;
-    // The aspect ratios may differ by the rounding of a side.
-    let apart = 2 * (width * rows).abs_diff(height * columns);
-    if width == 0 || height == 0 || apart > (width + height).max(rows + columns) {
-        return Err(wrong(format!(
-            "has {width}x{height} depths but the image {columns}x{rows} pixels; use one aspect ratio"
-        )));
-    }
     let axis = -camera.pose.matrix3.z_axis;
     let mut out = Image::new(columns, rows, 1);
     for (i, distance) in out.data.iter_mut().enumerate() {
@@ -39,6 +32,18 @@ pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image
         *distance = if depth > 0.0 && found > 0.0 && found <= f64::from(f32::MAX) { found as f32 } else { 0.0 };
     }
     Ok(out)
+}
+
+/// Checks that depths of a size cover the image of a camera.
+fn check_shape(path: &Path, [width, height]: [usize; 2], camera: &Camera) -> Result<()> {
+    let Camera { width: columns, height: rows, .. } = *camera;
+    // The aspect ratios may differ by the rounding of a side.
+    let apart = 2 * (width * rows).abs_diff(height * columns);
+    if width == 0 || height == 0 || apart > (width + height).max(rows + columns) {
+        let what = format!("has {width}x{height} depths but the image {columns}x{rows} pixels; use one aspect ratio");
+        return Err(Error::file(path, what));
+    }
+    Ok(())
 }
 
 /// What is wrong with depths in EXR. The remedy for images would encode them as colours.
@@ -116,9 +121,12 @@ impl Depths {
         decoded(path.as_ref()).map(drop)
     }
 
-    /// Reads a depth file, in its own unit.
-    pub(crate) fn read(path: &Path) -> Result<Self> {
+    /// Reads a depth file, in its own unit, for a camera; one without a size fits any.
+    pub(crate) fn read(path: &Path, camera: &Camera) -> Result<Self> {
         let (size, values) = decoded(path)?;
+        if camera.width > 0 {
+            check_shape(path, size, camera)?;
+        }
         Ok(Depths { size, values: values.into_iter().map(|depth| depth as f32).collect() })
     }
 

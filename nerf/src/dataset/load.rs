@@ -519,7 +519,7 @@ pub(super) fn size_for(path: &Path, camera: &Camera) -> Result<[usize; 2]> {
 
 /// The size of an image in the orientation of its camera, from its header.
 pub(super) fn fitting(header: &Header, path: &Path, camera: &Camera) -> Result<[usize; 2]> {
-    header.sizes.into_iter().find(|size| same_shape(*size, camera)).ok_or_else(|| {
+    used_size(header.sizes, camera).ok_or_else(|| {
         let (Camera { width, height, .. }, [w, h]) = (camera, header.sizes[0]);
         let what = format!("has {w}x{h} pixels but its camera {width}x{height}; use one aspect ratio");
         Error::file(path, what)
@@ -569,6 +569,11 @@ fn smaller_copy(folder: &Path, path: &Path, inside: &Path, downscale: usize) -> 
     let endings = ["png", "jpg", "JPG", "jpeg", "webp"].into_iter().filter(|end| !path.with_extension(end).is_file());
     let endings: Vec<PathBuf> = endings.map(|ending| other.with_extension(ending)).collect();
     [other].into_iter().chain(endings).find(|path| path.is_file())
+}
+
+/// The size of an image in the orientation of its camera, of those [as stored and as shown](Photo::size_of_file).
+pub(crate) fn used_size(sizes: [[usize; 2]; 2], camera: &Camera) -> Option<[usize; 2]> {
+    sizes.into_iter().find(|size| same_shape(*size, camera))
 }
 
 /// Returns true if the aspect ratios of an image and a camera agree, up to the rounding of a side. ffmpeg, and so

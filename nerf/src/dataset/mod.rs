@@ -38,7 +38,7 @@ pub use load::LoadOptions;
 pub use mask::Mask;
 pub use photo::Photo;
 pub use photo::save::{copy_cleared, copy_upright};
-pub use photo::unsupported::heif_size;
+pub use photo::unsupported::{ForeignFormat, ForeignImage};
 pub use scene_analysis::{EmptyBackground, SceneAnalysis};
 pub use scene_transform::SceneTransform;
 pub use scene_type::SceneType;

@@ -6,7 +6,7 @@ use super::image::{Image, pixel_index};
 use crate::error::{Error, Result};
 use crate::memory::{available_memory, gigabytes};
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
+use image::{ColorType, DynamicImage, ImageDecoder, ImageFormat, ImageReader};
 use raygrad_tensor::simd;
 use std::fs::File;
 use std::hash::{Hash, Hasher};
@@ -21,6 +21,7 @@ mod resample;
 pub(crate) mod save;
 pub(crate) mod sharpness;
 mod start;
+mod tiff;
 pub(crate) mod unsupported;
 
 /// The least alpha of an opaque pixel: 8-bit rounding may leave 254 of 255.
@@ -77,7 +78,7 @@ impl From<Image> for Photo {
 }
 
 impl Photo {
-    /// Reads a PNG, JPEG or WebP file, by its contents: RGBA if it has transparency, otherwise RGB.
+    /// Reads a PNG, JPEG, WebP, TIFF or BMP file, by its contents: RGBA if it has transparency, otherwise RGB.
     ///
     /// It applies the EXIF orientation, unless `size`, the width and height of the camera, is that of the stored
     /// pixels: programs that calibrate cameras use these.
@@ -149,13 +150,16 @@ impl Photo {
         Ok(decoder(path.as_ref())?.0.color_type().has_alpha())
     }
 
-    /// Reads the EXIF data of an image file, a TIFF structure, if it has any.
+    /// Reads the EXIF data of an image file, a TIFF structure, if it has any. A TIFF file is one itself.
     ///
     /// # Errors
     /// If the file cannot be read or is not an image.
     pub fn exif_of_file(path: impl AsRef<Path>) -> Result<Option<Vec<u8>>> {
         let path = path.as_ref();
         let (start, length) = start_of(path)?;
+        if tiff::is_tiff(&start) {
+            return std::fs::read(path).map(Some).map_err(|e| Error::file(path, format!("cannot be read: {e}")));
+        }
         // As for the header, the start of a JPEG suffices.
         if start.starts_with(JPEG)
             && let Ok((mut decoder, _)) = decoder_of(Cursor::new(&start), length, path)
@@ -446,6 +450,8 @@ impl Header {
             start if is_progressive(start) => length + 2 * channels * pixels,
             start if start.starts_with(JPEG) => length,
             [b'R', b'I', b'F', b'F', ..] => length + 4 * pixels,
+            // All pixels; those of CMYK have four values for three.
+            start if tiff::is_tiff(start) => decoded + decoded / 3,
             _ => 0,
         };
         let decoding = decoded + converted.max(turned).max(inner);
@@ -506,6 +512,9 @@ const MOST_PIXELS: usize = 1 << 28;
 /// pixel reach half of the former; damaged headers can claim any size.
 const MOST_BYTES: [u64; 2] = [1 << 14, 1 << 26];
 
+/// The formats that are decoded.
+const FORMATS: [ImageFormat; 5] =
+    [ImageFormat::Png, ImageFormat::Jpeg, ImageFormat::WebP, ImageFormat::Tiff, ImageFormat::Bmp];
 /// The most bytes of a file.
 const LONGEST: u64 = 1 << 31;
 
@@ -546,8 +555,8 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
         return Err(Error::file(path, what));
     }
     let mut reader = ImageReader::new(reader).with_guessed_format().map_err(unread)?;
-    if !matches!(reader.format(), Some(ImageFormat::Png | ImageFormat::Jpeg | ImageFormat::WebP)) {
-        return Err(bad("it is no PNG, JPEG or WebP file: convert it".into()));
+    if !reader.format().is_some_and(|format| FORMATS.contains(&format)) {
+        return Err(bad("it is no PNG, JPEG, WebP, TIFF or BMP file: convert it".into()));
     }
     if reader.format() == Some(ImageFormat::WebP) {
         let mut inner = reader.into_inner();
@@ -561,6 +570,9 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
     let size = [width as usize, height as usize];
     if size[0].saturating_mul(size[1]) > MOST_PIXELS {
         return Err(bad(format!("{width}x{height} pixels are more than the limit of 2^28")));
+    }
+    if matches!(decoder.color_type(), ColorType::Rgb32F | ColorType::Rgba32F) {
+        return Err(bad("its values are floats, whose white is unknown: save it with 8 or 16 bits".into()));
     }
     if decoder.total_bytes() > MOST_BYTES[0].saturating_mul(length).saturating_add(MOST_BYTES[1]) {
         return Err(bad(format!("{width}x{height} pixels cannot come from {length} bytes: copy it again")));

@@ -163,11 +163,12 @@ impl SceneAnalysis {
             );
             return Err(Error::file(&capture.file, what));
         }
+        let rotation = upright(&cameras);
         let half = match scene_type {
-            SceneType::Bounded => half_width(&cameras, middle),
+            SceneType::Bounded => half_width(&cameras, middle).min(clearance(&cameras, middle, rotation)),
             SceneType::Unbounded | SceneType::ForwardFacing => inner,
         };
-        let transform = SceneTransform { rotation: upright(&cameras), scale: HALF_BOX / half, origin: middle };
+        let transform = SceneTransform { rotation, scale: HALF_BOX / half, origin: middle };
         let [near, far] = match scene_type {
             SceneType::Bounded => around_box(cameras.iter().map(|c| transform.point(c.pose.translation)), BOX),
             SceneType::Unbounded | SceneType::ForwardFacing => {
@@ -363,6 +364,19 @@ fn half_width(cameras: &[&Camera], middle: DVec3) -> f64 {
         });
         camera.pose.translation.distance(middle) * x.max(y).min(1.0)
     }))
+}
+
+/// The half width of a cube around the centre of the scene that leaves out cameras at the usual distance in nearly all
+/// directions: with a wide lens, their views are wider than that.
+fn clearance(cameras: &[&Camera], middle: DVec3, rotation: DMat3) -> f64 {
+    /// The share of the directions whose cameras may be inside, and of the distance to them that the cube takes.
+    const SHARES: [f64; 2] = [0.05, 0.95];
+    let offsets = cameras.iter().map(|camera| rotation * (camera.pose.translation - middle));
+    let offsets: Vec<DVec3> = offsets.filter(|offset| *offset != DVec3::ZERO).collect();
+    let mut sides: Vec<f64> = offsets.iter().map(|offset| offset.normalize().abs().max_element()).collect();
+    sides.sort_by(f64::total_cmp);
+    let side = sides.get((SHARES[0] * sides.len() as f64) as usize).copied().unwrap_or(f64::INFINITY);
+    SHARES[1] * side * median(offsets.iter().map(|offset| offset.length()))
 }
 
 /// The most cameras and points that are used; more would not change the result.

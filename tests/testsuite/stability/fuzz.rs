@@ -206,6 +206,10 @@ const DECODED: Bound = Bound { times: 8 << 14, plus: 8 << 26 };
 /// An image with transparency, camera metadata and lossy compression: see `reference/lossy.py`.
 const LOSSY: &[u8] = include_bytes!("reference/lossy.webp");
 
+/// Three by two pixels of 24 bits.
+const BMP: &[u8] = b"BM\x4e\0\0\0\0\0\0\0\x36\0\0\0\x28\0\0\0\x03\0\0\0\x02\0\0\0\x01\0\x18\0\0\0\0\0\x18\0\0\0\
+    \0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\x01\x02\x03\x04\x05\x06\x07\x08\x09\0\0\0\x11\x12\x13\x14\x15\x16\x17\x18\x19\0\0\0";
+
 #[test]
 fn campaign_pictures() {
     let grey = include_bytes!("reference/grey.jpg").to_vec();
@@ -220,6 +224,8 @@ fn campaign_pictures() {
         ),
         ("JPEG", vec![grey, picture("jpg", 3)]),
         ("WebP", vec![picture("webp", 3), picture("webp", 4), LOSSY.to_vec()]),
+        ("TIFF", vec![picture("tif", 3), picture("tif", 4)]),
+        ("BMP", vec![BMP.to_vec()]),
     ] {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("picture.png");

@@ -11,6 +11,7 @@ mod encoding;
 mod entries;
 mod models;
 mod pose;
+mod splits;
 mod table;
 mod text;
 
@@ -83,11 +84,11 @@ pub(super) fn images_beside(file: &Path) -> Option<PathBuf> {
 pub fn read(folder: &Path) -> Result<Capture> {
     let what = "has no COLMAP model: expected cameras.bin and images.bin, or both as .txt, in sparse/0";
     let model = models(folder).into_iter().next().ok_or_else(|| Error::file(folder, what))?;
-    read_model(folder, &model)
+    read_model(folder, &model, true)
 }
 
-/// Reads the model with this file of images.
-pub(super) fn read_model(folder: &Path, images: &Path) -> Result<Capture> {
+/// Reads the model with this file of images. Lists of splits are read only if they are `needed`.
+pub(super) fn read_model(folder: &Path, images: &Path, needed: bool) -> Result<Capture> {
     let model = images.parent().unwrap_or(folder);
     let is_own = |encoding: &Encoding| encoding.files(model)[1] == images;
     let encoding = Encoding::ALL.into_iter().find(is_own).unwrap_or(Encoding::Binary);
@@ -98,6 +99,9 @@ pub(super) fn read_model(folder: &Path, images: &Path) -> Result<Capture> {
     let points = points.is_file().then(|| std::fs::read(points));
     let mut capture = parse(folder, encoding, &files, [&content(cameras)?, &content(images)?], points)?;
     beside::attach(&mut capture, model)?;
+    if needed {
+        splits::attach(&mut capture, model)?;
+    }
     Ok(capture)
 }
 

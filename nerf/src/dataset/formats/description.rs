@@ -55,7 +55,7 @@ impl Description {
         match format {
             Format::Blender => blender::read_files(folder, needed),
             Format::Transforms => transforms::read_file(folder, file, needed),
-            Format::Colmap => colmap::read_model(folder, file),
+            Format::Colmap => colmap::read_model(folder, file, needed),
             Format::Llff => llff::read(folder),
         }
     }
@@ -186,6 +186,15 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
             ));
         }
         let capture = description.read(needed)?;
+        if let Some(inner) = undistorted_within(&capture, needed)? {
+            let what = format!(
+                "has a lens, and the only images found for it, in `{}`, are without: name `{}`, or put the images of \
+                 this model beside it",
+                below(&capture.folder, &inner.folder),
+                below(&capture.folder, &inner.file)
+            );
+            return Err(Error::file(path, what));
+        }
         let is_alone = description.format == Format::Transforms;
         let around = description.folder.parent().filter(|_| is_alone).unwrap_or(&description.folder);
         return with_images_around(around, capture, needed);
@@ -200,7 +209,12 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
         return Err(unknown(path, asked));
     }
     if is_usual {
-        return most_complete(&all, needed);
+        let capture = most_complete(&all, needed)?;
+        let Some(mut inner) = undistorted_within(&capture, needed)? else { return Ok(capture) };
+        let [own, other] = [&capture, &inner].map(|capture| below(path, &capture.file));
+        let what = format!("`{own}` has a lens, and its images were undistorted for `{other}`: used this");
+        inner.assumptions.insert(0, what);
+        return Ok(inner);
     }
     check_single(path, &all)?;
     let capture = most_complete(&all, needed)?;
@@ -246,6 +260,26 @@ fn with_images_around(top: &Path, capture: Capture, needed: bool) -> Result<Capt
         return Ok(around);
     }
     Ok(capture)
+}
+
+/// The capture of pinhole cameras in a folder of a COLMAP model with a lens, if the images that were found for the model
+/// are those of that capture: COLMAP undistorts to `dense/0`, under the same names.
+fn undistorted_within(capture: &Capture, needed: bool) -> Result<Option<Capture>> {
+    let is_pinhole = |view: &View| view.camera.lens == Lens::Pinhole;
+    let Some(image) = capture.present().next().and_then(|view| view.image.as_deref()) else { return Ok(None) };
+    if capture.format != Format::Colmap || capture.views.iter().all(is_pinhole) {
+        return Ok(None);
+    }
+    let is_below = |folder: &&Path| folder.starts_with(&capture.folder) && *folder != capture.folder;
+    for folder in image.ancestors().skip(1).take_while(is_below) {
+        for file in colmap::models(folder) {
+            let inner = Description::of_model(folder, file).read(needed)?;
+            if inner.present().any(|view| view.image.as_deref() == Some(image)) && inner.views.iter().all(is_pinhole) {
+                return Ok(Some(inner));
+            }
+        }
+    }
+    Ok(None)
 }
 
 /// Reads the capture of the description with most existing images.

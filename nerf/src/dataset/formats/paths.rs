@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use unicode_normalization::UnicodeNormalization;
 
 /// Extensions of image files, tried in this order if a name has none.
-const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "webp", "jfif", "jpe"];
+const EXTENSIONS: [&str; 9] = ["png", "jpg", "jpeg", "webp", "jfif", "jpe", "tif", "tiff", "bmp"];
 
 /// Extensions of images that other programs list or that stand beside others: converted before, or not decoded here.
-const OTHERS: [&str; 12] = ["heic", "heif", "avif", "tif", "tiff", "bmp", "gif", "dng", "arw", "cr2", "nef", "exr"];
+const OTHERS: [&str; 9] = ["heic", "heif", "avif", "gif", "dng", "arw", "cr2", "nef", "exr"];
 
 /// The longest path, in bytes. Operating systems allow a few times as many at most.
 const LONGEST: usize = 1024;

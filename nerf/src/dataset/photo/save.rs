@@ -5,9 +5,11 @@ use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
+use image::codecs::tiff::TiffEncoder;
 use image::codecs::webp::WebPEncoder;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageBuffer, ImageDecoder, ImageEncoder, ImageError};
+use std::io::Cursor;
 use std::path::Path;
 
 /// Of 100. The loss is not visible.
@@ -21,8 +23,8 @@ struct About {
 }
 
 impl Photo {
-    /// Writes the image in the format of the file extension: PNG (16 bits where it has them), JPEG of quality 95, or
-    /// lossless WebP.
+    /// Writes the image in the format of the file extension: PNG or TIFF (16 bits where it has them), JPEG of quality 95,
+    /// or lossless WebP.
     ///
     /// # Errors
     /// If the extension is another, a JPEG would need an alpha channel, or the file cannot be written.
@@ -47,7 +49,7 @@ impl Photo {
 
 /// Copies an image file and applies its EXIF orientation to the pixels.
 ///
-/// Other EXIF data, such as the focal length, stays. Without a rotation, the file is copied byte for byte if it can be
+/// Other EXIF data, such as the focal length, stays, but for that of rotated TIFF. Without a rotation, the file is copied byte for byte if it can be
 /// decoded.
 ///
 /// # Errors
@@ -103,7 +105,9 @@ fn save(decoded: &DynamicImage, path: &Path, about: About) -> Result<()> {
         }
         "jpg" | "jpeg" => encode(decoded, JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY), about),
         "webp" => encode(decoded, WebPEncoder::new_lossless(&mut bytes), about),
-        _ => return Err(Error::file(path, "cannot be written: name it .png, .jpg or .webp")),
+        // The encoder has no place for EXIF data.
+        "tif" | "tiff" => encode(decoded, TiffEncoder::new(Cursor::new(&mut bytes)), About { exif: None, ..about }),
+        _ => return Err(Error::file(path, "cannot be written: name it .png, .jpg, .webp or .tif")),
     };
     encoded.map_err(|e| Error::file(path, format!("cannot be encoded: {e}")))?;
     write_atomic(path, &bytes)
@@ -135,8 +139,10 @@ mod tests {
         ] {
             let photo = Photo { width: 3, height: 2, channels, values };
             let path = folder.path().join("photo.PNG");
-            photo.save(&path).unwrap();
-            assert_eq!(Photo::open(&path, None).unwrap(), photo);
+            for path in [&path, &folder.path().join("photo.tif")] {
+                photo.save(path).unwrap();
+                assert_eq!(Photo::open(path, None).unwrap(), photo);
+            }
             if let (Values::Bytes(_), true) = (&photo.values, channels == 4) {
                 photo.save(folder.path().join("photo.webp")).unwrap();
                 assert_eq!(Photo::open(folder.path().join("photo.webp"), None).unwrap(), photo);
@@ -147,7 +153,7 @@ mod tests {
         let grey = Photo { width: 16, height: 8, channels: 3, values: Values::Bytes(vec![90; 384]) };
         grey.save(folder.path().join("grey.jpeg")).unwrap();
         assert_eq!(Photo::open(folder.path().join("grey.jpeg"), None).unwrap(), grey);
-        assert!(grey.save(folder.path().join("grey.tif")).unwrap_err().to_string().contains("name it .png"));
+        assert!(grey.save(folder.path().join("grey.bmp")).unwrap_err().to_string().contains("name it .png"));
     }
 
     #[test]

@@ -235,6 +235,10 @@ fn decoding_takes_at_most_the_announced_memory() {
         ("grey16.png", DynamicImage::ImageLuma16(grey.to_luma16())),
         ("rgb.jpg", DynamicImage::ImageRgb8(grey.to_rgb8())),
         ("rgb.webp", DynamicImage::ImageRgb8(grey.to_rgb8())),
+        ("rgb.tif", DynamicImage::ImageRgb8(grey.to_rgb8())),
+        ("deep.tiff", DynamicImage::ImageRgba16(grey.to_rgba16())),
+        ("grey.bmp", grey.clone()),
+        ("rgb.bmp", DynamicImage::ImageRgb8(grey.to_rgb8())),
     ];
     for (name, image) in all {
         let path = folder.path().join(name);

@@ -1,5 +1,6 @@
 use super::*;
 use crate::camera::lens::Lens;
+use crate::dataset::Split;
 use crate::dataset::capture::Point;
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use std::fs;
@@ -524,6 +525,38 @@ fn images_are_found_in_other_folders_and_spellings() {
     let (images, assumptions) = found().unwrap();
     assert_eq!(images[1], Some(folder.path().join("photos/b/second.png")));
     assert_eq!(assumptions.len(), 2, "{assumptions:?}");
+}
+
+#[test]
+fn lists_of_splits_are_read() {
+    let files = eight(|_| None);
+    let folder = folder(Encoding::Text, "sparse/0", &files);
+    let list = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
+    let splits = |needed: bool| {
+        let model = folder.path().join("sparse/0/images.txt");
+        let capture = read_model(folder.path(), &model, needed)?;
+        let of = |split: Option<Split>| capture.views.iter().filter(|view| view.split == split).count();
+        let counts = [None, Some(Split::Train), Some(Split::Val), Some(Split::Test)].map(of);
+        Ok::<_, Error>((counts, capture.assumptions))
+    };
+    let names: Vec<String> = read(folder.path()).unwrap().views.into_iter().map(|view| view.name).collect();
+    assert_eq!((names.len(), splits(true).unwrap()), (8, ([8, 0, 0, 0], vec![])));
+    // Of 3D Gaussian Splatting: with Windows line ends, an empty line and a name without its ending.
+    let stem = names[3].rsplit_once('.').unwrap().0;
+    list("sparse/0/test.txt", &format!("\u{feff}# test\r\n{}\r\n\r\n{stem}\r\n", names[1]));
+    assert_eq!(splits(true).unwrap(), ([6, 0, 0, 2], vec![]));
+    assert_eq!(splits(false).unwrap(), ([8, 0, 0, 0], vec![]));
+    // Of nerfstudio, with a path and a name that the model lacks.
+    list("train_list.txt", &format!("images/{}\n{}\nother.png\n", names[0], names[2]));
+    list("validation_list.txt", &names[4]);
+    list("test_list.txt", &names[1]);
+    let expected = ["`train_list.txt` lists 1 images that the model lacks, such as `other.png`".to_owned()];
+    assert_eq!(splits(true).unwrap(), ([3, 2, 1, 2], expected.to_vec()));
+    list("test_list.txt", &format!("{}\n{}", names[1], names[0]));
+    let message = splits(true).unwrap_err().to_string();
+    let expected = format!("test_list.txt: `line 2`: `{}` is a train image by another list", names[0]);
+    assert!(message.contains(&expected), "{message}");
+    assert!(splits(false).is_ok());
 }
 
 #[test]

@@ -85,6 +85,47 @@ fn most_complete_description_counts() {
     );
 }
 
+/// COLMAP's own workspace: a model with a lens, whose images are elsewhere, and undistorted images with their model.
+#[test]
+fn undistorted_images_are_not_those_of_a_lens() {
+    for inner in ["dense/0", "dense"] {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, inner) = (folder.path(), folder.path().join(inner));
+        std::fs::create_dir_all(&inner).unwrap();
+        write(&inner, Format::Colmap, [4, 4], 0);
+        let mut capture = read(&inner, None).unwrap();
+        let lens = Lens::Brown { k: [0.1, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+        capture.views.iter_mut().for_each(|view| view.camera.lens = lens);
+        colmap::write(&capture, path, Encoding::Binary).unwrap();
+        let used = read(path, None).unwrap();
+        assert_eq!((used.folder, used.file), (inner.clone(), inner.join("sparse/0/images.bin")));
+        let name = inner.strip_prefix(path).unwrap().display().to_string();
+        let expected = format!(
+            "`sparse/0/images.bin` has a lens, and its images were undistorted for `{name}/sparse/0/images.bin`: used \
+             this"
+        );
+        assert_eq!(used.assumptions, [expected]);
+        let own = path.join("sparse/0/images.bin");
+        let message = read(&own, None).unwrap_err().to_string();
+        let expected = format!("images.bin: has a lens, and the only images found for it, in `{name}`, are without");
+        assert!(message.contains(&expected), "{message}");
+        // Its own images, and a model of the same images with a lens, are used as they are.
+        for i in 0..4 {
+            kit::picture(&path.join(format!("images/{i}.png")), 8, 6);
+        }
+        for path in [path, &own] {
+            let used = read(path, None).unwrap();
+            assert_eq!((used.file, used.assumptions), (own.clone(), vec![]));
+        }
+        std::fs::remove_dir_all(path.join("images")).unwrap();
+        std::fs::remove_dir_all(inner.join("sparse")).unwrap();
+        std::fs::create_dir_all(inner.join("sparse")).unwrap();
+        std::fs::rename(path.join("sparse/0"), inner.join("sparse/0")).unwrap();
+        colmap::write(&capture, path, Encoding::Binary).unwrap();
+        assert_eq!(read(path, None).unwrap().file, own);
+    }
+}
+
 #[test]
 fn a_stale_list_of_images_gives_way_to_a_complete_model() {
     let folder = tempfile::tempdir().unwrap();
