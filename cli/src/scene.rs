@@ -13,13 +13,78 @@ use raygrad_scenes::{embedded, landscape, landscape_distances};
 use serde::{Deserialize, Serialize};
 
 use super::builtin;
-use super::output::complain;
+use super::output::{complain, quoted};
+use super::parse;
 use super::progress::Progress;
 
 /// Width and height of the embedded scene's images in pixels.
 pub const EMBEDDED_SIZE: usize = 200;
 /// Width and height of the landscape's images in pixels.
 pub const LANDSCAPE_SIZE: [usize; 2] = [400, 300];
+
+/// How the files of a capture are read.
+#[derive(Default, clap::Args)]
+pub struct CaptureArgs {
+    /// Test images: none, every:N, or names
+    ///
+    /// Holds these images out of training, in place of the choice of the capture's files. every:8 holds out every
+    /// eighth by name, which is the default where the files have no splits. Example: --test frame_3.jpg,frame_9.jpg
+    #[arg(long, help_heading = "Scene", value_name = "IMAGES", value_parser = parse::word::<HoldOut>)]
+    pub test: Option<HoldOut>,
+    /// transforms, blender, colmap or llff
+    ///
+    /// Chooses the files to read if a folder has several descriptions of a capture. By default the one with most
+    /// images counts. The path of a description, such as my-scene/sparse/1/images.bin, chooses it too.
+    #[arg(long, help_heading = "Scene", value_name = "FORMAT", value_parser = parse::word::<Format>)]
+    pub format: Option<Format>,
+    /// bounded, unbounded or forward-facing
+    ///
+    /// bounded: an object in front of an empty background. unbounded: the images show the surroundings.
+    /// forward-facing: unbounded, and all cameras look the same way. By default raygrad infers the type from images
+    /// and cameras, and prints it with the reason.
+    #[arg(long, help_heading = "Scene", value_name = "TYPE", value_parser = parse::word::<SceneType>)]
+    pub scene_type: Option<SceneType>,
+    /// Masks cut out an object: make the rest transparent
+    ///
+    /// Without the flag, pixels that a mask hides are ignored, and the model may put anything there. With it, the
+    /// model learns that nothing is there. Every image needs a mask or transparency.
+    #[arg(long, help_heading = "Scene")]
+    pub mask_as_alpha: bool,
+}
+
+impl CaptureArgs {
+    /// Reads the capture of a folder.
+    pub fn read(&self, folder: &Path) -> Result<Capture> {
+        // The splits of the files are not used.
+        let Some(chosen) = &self.test else { return Capture::read_format(folder, self.format) };
+        let mut capture = Capture::read_unsplit(folder, None, self.format)?;
+        capture.hold_out(chosen)?;
+        Ok(capture)
+    }
+
+    /// Finds the scene of a capture.
+    pub fn analyze(&self, capture: &Capture) -> Result<SceneAnalysis> {
+        match self.mask_as_alpha {
+            true => capture.analyze_cutout(self.scene_type),
+            false => capture.analyze_scene(self.scene_type),
+        }
+    }
+
+    /// These flags as they were given, each after a blank.
+    pub fn flags(&self) -> String {
+        let format = self.format.map(|format| match format {
+            Format::Blender => "blender",
+            Format::Transforms => "transforms",
+            Format::Colmap => "colmap",
+            Format::Llff => "llff",
+        });
+        let test = self.test.as_ref().map(|test| format!(" --test {}", quoted(Path::new(&test.to_string()))));
+        let format = format.map(|format| format!(" --format {format}"));
+        let scene_type = self.scene_type.map(|scene_type| format!(" --scene-type {scene_type}"));
+        let masks = self.mask_as_alpha.then(|| " --mask-as-alpha".to_owned());
+        [test, format, scene_type, masks].into_iter().flatten().collect()
+    }
+}
 
 /// A folder of images, or a built-in scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -56,27 +121,22 @@ impl fmt::Display for Scene {
 }
 
 impl Scene {
-    /// Reads the scene's files and analyses the scene. `asked` overrides the scene type; with `mask_as_alpha` masks cut
-    /// out an object. See [`capture`](Self::capture) for the other arguments.
-    pub fn open(
-        &self,
-        asked: Option<SceneType>,
-        mask_as_alpha: bool,
-        hold_out: Option<&HoldOut>,
-        description: Option<&Path>,
-    ) -> Result<Opened> {
+    /// Reads the scene's files and analyses the scene.
+    pub fn open(&self, args: &CaptureArgs) -> Result<Opened> {
+        let CaptureArgs { test, format, scene_type, mask_as_alpha } = args;
+        let description = format.map_or(Ok(None), |format| self.description(format))?;
         if !matches!(self, Scene::Folder(_)) {
-            if mask_as_alpha {
+            if *mask_as_alpha {
                 return Err(Error::setting("mask-as-alpha", "built-in scenes have no masks: leave the flag out"));
             }
-            if hold_out.is_some() {
+            if test.is_some() {
                 return Err(Error::setting("test", "built-in scenes have their own test images: leave the flag out"));
             }
-            return Ok(Opened::new(self, None, asked));
+            return Ok(Opened::new(self, None, *scene_type));
         }
-        let capture = self.capture(hold_out, description)?;
-        let analysis = if mask_as_alpha { capture.analyze_cutout(asked) } else { capture.analyze_scene(asked) }?;
-        Ok(Opened { mask_as_alpha, ..Opened::new(self, Some((capture, analysis)), asked) })
+        let capture = self.capture(test.as_ref(), description.as_deref())?;
+        let analysis = args.analyze(&capture)?;
+        Ok(Opened { mask_as_alpha: *mask_as_alpha, ..Opened::new(self, Some((capture, analysis)), *scene_type) })
     }
 
     /// Reads the capture of a folder, or builds that of a built-in scene without images, and prints what the reader
@@ -285,12 +345,13 @@ mod tests {
         });
         std::fs::write(folder.path().join("transforms.json"), transforms.to_string()).unwrap();
         let scene = Scene::Folder(folder.path().to_owned());
-        let message = scene.open(None, false, None, None).err().unwrap().to_string();
+        let message = scene.open(&CaptureArgs::default()).err().unwrap().to_string();
         let remedy = "has too: remove it from one of them; `raygrad train --test` chooses other test images";
         assert!(message.ends_with(remedy), "{message}");
-        let description = scene.description(Format::Transforms).unwrap();
-        for description in [None, description.as_deref()] {
-            let opened = scene.open(None, false, Some(&HoldOut::Every(2)), description).unwrap();
+        for format in [None, Some(Format::Transforms)] {
+            let args = CaptureArgs { test: Some(HoldOut::Every(2)), format, ..CaptureArgs::default() };
+            let opened = scene.open(&args).unwrap();
+            assert_eq!(args.read(folder.path()).unwrap().split(Split::Train).unwrap().len(), 2);
             let names = |split| {
                 let frames = opened.load(split, 1, usize::MAX).unwrap().frames;
                 frames.into_iter().map(|frame| frame.name).collect::<Vec<_>>()
@@ -314,7 +375,7 @@ mod tests {
         std::fs::write(folder.path().join("transforms.json"), transforms.to_string()).unwrap();
         let scene = Scene::Folder(folder.path().to_owned());
         for mask_as_alpha in [false, true] {
-            let opened = scene.open(None, mask_as_alpha, None, None).unwrap();
+            let opened = scene.open(&CaptureArgs { mask_as_alpha, ..CaptureArgs::default() }).unwrap();
             let data = opened.load(Split::Train, 1, usize::MAX).unwrap();
             assert_eq!(data.scene_type == SceneType::Bounded, mask_as_alpha);
             let frame = &data.frames[0];
@@ -322,7 +383,15 @@ mod tests {
             let [hidden, used] = [[3, 2], [4, 2]].map(|[x, y]| frame.image.pixel(x, y)[3]);
             assert_eq!((hidden, used), (f32::from(u8::from(!mask_as_alpha)), 1.0));
         }
-        let message = Scene::Embedded.open(None, true, None, None).err().unwrap().to_string();
+        let flags = CaptureArgs {
+            test: Some(HoldOut::Images(vec!["my shot.jpg".into()])),
+            format: Some(Format::Colmap),
+            scene_type: Some(SceneType::ForwardFacing),
+            mask_as_alpha: true,
+        };
+        let expected = " --test 'my shot.jpg' --format colmap --scene-type forward-facing --mask-as-alpha";
+        assert_eq!(flags.flags(), expected);
+        let message = Scene::Embedded.open(&CaptureArgs { format: None, ..flags }).err().unwrap().to_string();
         assert_eq!(message, "`mask-as-alpha`: built-in scenes have no masks: leave the flag out");
     }
 }

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use clap::Parser;
 use raygrad::Schedule;
-use raygrad::nerf::dataset::{AutomaticDownscale, Dataset, DownscaleLimit, Format, HoldOut, SceneType, Split};
+use raygrad::nerf::dataset::{AutomaticDownscale, Dataset, DownscaleLimit, Split};
 use raygrad::nerf::model::RefinedParam;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
@@ -25,7 +25,7 @@ use super::prepare::beside;
 use super::preview::Preview;
 use super::progress::spoken;
 use super::run::{CHECKPOINTS, Run, RunConfig, choose_folder};
-use super::scene::{Opened, Scene};
+use super::scene::{CaptureArgs, Opened, Scene};
 use super::summary::Ended;
 use super::view::{Listener, PlaceArgs, TrainingViewer};
 use super::watch::Watch;
@@ -129,31 +129,8 @@ pub struct Args {
     /// pixels, since the model resolves no more. 1 keeps the size. Range: 1 to 16384.
     #[arg(long, help_heading = "Scene", value_name = "K", value_parser = parse::count(1 << 14))]
     downscale: Option<usize>,
-    /// Test images: none, every:N, or names
-    ///
-    /// Holds these images out of training, in place of the choice of the capture's files. every:8 holds out every
-    /// eighth by name, which is the default where the files have no splits. Example: --test frame_3.jpg,frame_9.jpg
-    #[arg(long, help_heading = "Scene", value_name = "IMAGES", value_parser = parse::word::<HoldOut>)]
-    test: Option<HoldOut>,
-    /// transforms, blender, colmap or llff
-    ///
-    /// Chooses the files to read if a folder has several descriptions of a capture. By default the one with most
-    /// images counts. The path of a description, such as my-scene/sparse/1/images.bin, chooses it too.
-    #[arg(long, help_heading = "Scene", value_name = "FORMAT", value_parser = parse::word::<Format>)]
-    format: Option<Format>,
-    /// bounded, unbounded or forward-facing
-    ///
-    /// bounded: an object in front of an empty background. unbounded: the images show the surroundings.
-    /// forward-facing: unbounded, and all cameras look the same way. By default raygrad infers the type from images
-    /// and cameras, and prints it with the reason.
-    #[arg(long, help_heading = "Scene", value_name = "TYPE", value_parser = parse::word::<SceneType>)]
-    scene_type: Option<SceneType>,
-    /// Masks cut out an object: make the rest transparent
-    ///
-    /// Without the flag, pixels that a mask hides are ignored, and the model may put anything there. With it, the
-    /// model learns that nothing is there. Every image needs a mask or transparency.
-    #[arg(long, help_heading = "Scene")]
-    mask_as_alpha: bool,
+    #[command(flatten)]
+    capture: CaptureArgs,
     /// Background: white, black, random or expected
     ///
     /// Lies behind transparent images, and behind opaque ones too if given. The default for transparent images is
@@ -298,8 +275,7 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
         Scene::Folder(input) if beside::is_unprepared(input) => Scene::Folder(beside::dataset(input)?),
         scene => scene.clone(),
     };
-    let description = args.format.map_or(Ok(None), |format| source.description(format))?;
-    let mut scene = source.open(args.scene_type, args.mask_as_alpha, args.test.as_ref(), description.as_deref())?;
+    let mut scene = source.open(&args.capture)?;
     let AutomaticDownscale { factor: downscale, limit } = match args.downscale {
         Some(factor) => AutomaticDownscale { factor, limit: None },
         None => scene.automatic_downscale(|scene_type| args.most_cells(scene_type))?,
@@ -331,7 +307,7 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     };
     describe(&run, &trainer, &data, &scene)?;
     // Warnings come after all checks, so that an error is the only line of output.
-    doctor::warn(&scene);
+    doctor::warn(&scene, &args.capture);
     let marching = trainer.model.config.sampler.get::<MarchingConfig>();
     if let Some(note) = marching.and_then(|marching| args.idle_cores(marching.tiles)) {
         complain(&note);
@@ -478,7 +454,11 @@ fn train(
 ) -> Result<Trained> {
     // A page can pause the training for as long as it likes.
     let timeout = if args.view { ranks::PATIENCE } else { args.rank_timeout };
-    share(&mut trainer, &run, budget, timeout)?;
+    if let Err(error) = share(&mut trainer, &run, budget, timeout) {
+        // The same command may be given again.
+        run.discard_untrained(lock);
+        return Err(error);
+    }
     let sent = |trainer: &mut Trainer| trainer.exchange_mut().map(|exchange| exchange.sent_bytes());
     let before = (trainer.stats().step, sent(&mut trainer));
     let mut window = listener.map(|listener| TrainingViewer::open(listener, &run, &trainer)).transpose()?;
@@ -504,7 +484,7 @@ fn train(
                 return Err(Error::setting("mpi", what));
             }
         };
-        if interrupted && !interrupt::requested() {
+        if interrupted {
             watch.stop(&trainer);
         }
         let reason = (trainer.stats().ends_diverged() && !watch.has_lost_its_run()).then(|| watch::reason(&trainer));

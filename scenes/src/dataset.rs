@@ -54,7 +54,7 @@ pub fn landscape(split: Split, width: usize) -> Dataset {
 
 /// Renders a split of forward-facing images of the landscape: 30 training, 3 validation or 6 test images.
 ///
-/// The scene box reaches 3 units around the bulldozer, and nothing is nearer than half a unit.
+/// The scene box is the cube of +-1.5 around the bulldozer, and nothing is nearer than half a unit.
 ///
 /// # Panics
 /// If `width` is not a multiple of 4.

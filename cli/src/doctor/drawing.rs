@@ -107,7 +107,7 @@ fn legend(stage: &Stage, area: &Area<'_>) -> Drawn {
         (TRAIN, format!("{} training", count("train")), count("train")),
         (TEST, format!("{} held out", count("test")), count("test")),
         (FLAGGED, format!("{flagged} with a finding"), flagged),
-        (ABSENT, format!("{} without an image", count("absent")), count("absent")),
+        (ABSENT, format!("{} not used", count("absent")), count("absent")),
         (BOX, if stage.bounded { "scene box" } else { "scene box (unbounded scene)" }.to_owned(), 1),
     ];
     let mut x = 16;

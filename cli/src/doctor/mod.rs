@@ -8,7 +8,6 @@ mod table;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use raygrad::nerf::dataset::{Capture, SceneType};
 use raygrad::nerf::doctor::{DoctorOptions, Finding, FindingKind, Report, Severity, examine, examine_cameras};
 use raygrad::nerf::{Error, Result, write_atomic};
 
@@ -16,7 +15,7 @@ use super::output::{complain, make_folder, print, quoted};
 use super::overwrite::{Job, png_with_text};
 use super::parse;
 use super::progress::Progress;
-use super::scene::{Opened, Scene};
+use super::scene::{CaptureArgs, Opened, Scene};
 use serde_json::Value;
 use stage::Stage;
 
@@ -31,11 +30,14 @@ use stage::Stage;
 pub struct Args {
     /// Capture folder, in any format that train reads
     pub scene: Scene,
-    /// bounded, unbounded or forward-facing
+    #[command(flatten)]
+    pub capture: CaptureArgs,
+    /// Most images to compare with their neighbours
     ///
-    /// By default raygrad infers the type from images and cameras.
-    #[arg(long, help_heading = "Scene", value_name = "TYPE", value_parser = parse::word::<SceneType>)]
-    pub scene_type: Option<SceneType>,
+    /// Each of these, evenly spaced, shows whether its own pose is right. All images are read in any case. By default
+    /// they are 120.
+    #[arg(long, help_heading = "Computation", value_name = "N", value_parser = parse::count(1 << 20))]
+    pub compare: Option<usize>,
     /// Folder for cameras.png and doctor.html
     ///
     /// They replace those of an earlier check.
@@ -58,12 +60,17 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let job = Job::new("doctor", &Value::Null, args.overwrite);
     let files = ["cameras.png", "doctor.html"].map(|name| args.out.join(name));
     files.iter().try_for_each(|file| job.check(file))?;
-    let capture = Capture::read(folder)?;
-    let analysis = capture.analyze_scene(args.scene_type);
+    let capture = args.capture.read(folder)?;
+    let analysis = args.capture.analyze(&capture);
     make_folder(&args.out)?;
     let progress = Progress::new();
     let show = |done: usize, total: usize| progress.count(done, total, "images checked");
-    let report = examine(&capture, analysis.as_ref(), &DoctorOptions { progress: &show, ..DoctorOptions::default() });
+    let usual = DoctorOptions::default();
+    let report = examine(
+        &capture,
+        analysis.as_ref(),
+        &DoctorOptions { compared: args.compare.unwrap_or(usual.compared), progress: &show },
+    );
     drop(progress);
     let stage = Stage::new(&capture, analysis.as_ref().ok(), &report);
     let drawn = drawing::draw(&stage).map_err(|e| Error::file(&files[0], e))?;
@@ -85,8 +92,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     })
 }
 
-/// Warns of problems with the cameras of a training scene, one line each.
-pub fn warn(scene: &Opened) {
+/// Warns of problems with the cameras of a training scene, one line each. `args` are those that it was read with.
+pub fn warn(scene: &Opened, args: &CaptureArgs) {
     let Some((capture, analysis)) = &scene.capture else { return };
     let Report { findings, .. } = examine_cameras(capture, Ok(analysis));
     // Loading warns of absent images itself.
@@ -94,7 +101,8 @@ pub fn warn(scene: &Opened) {
     for Finding { kind, severity, what, .. } in findings.iter().filter(|finding| !said(finding)) {
         if *severity > Severity::Note {
             let folder = quoted(&capture.folder);
-            complain(&format!("{severity}: {kind}: {what}; `raygrad doctor {folder}` shows details"));
+            let flags = args.flags();
+            complain(&format!("{severity}: {kind}: {what}; `raygrad doctor {folder}{flags}` shows details"));
         }
     }
 }

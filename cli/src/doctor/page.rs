@@ -1,6 +1,7 @@
 //! The self-contained page of facts, findings, images and cameras.
 
 use std::collections::HashMap;
+use std::path::Path;
 
 use base64::prelude::{BASE64_STANDARD, Engine};
 use raygrad::nerf::dataset::{Capture, Photo, View};
@@ -26,7 +27,7 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage, mark: &str) -> Re
     let facts: String =
         rows.iter().map(|(name, value)| format!("<tr><th>{name}</th><td>{}</td></tr>\n", escaped(value))).collect();
     let views: HashMap<&str, &View> = capture.views.iter().rev().map(|view| (view.name.as_str(), view)).collect();
-    let mut findings: String = report.findings.iter().map(|finding| section(&views, finding)).collect();
+    let mut findings: String = report.findings.iter().map(|finding| section(capture, &views, finding)).collect();
     if findings.is_empty() {
         findings = "<p class=\"good\">No problems found.</p>".to_owned();
     }
@@ -39,17 +40,17 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage, mark: &str) -> Re
 }
 
 /// A finding with some of its images.
-fn section(photographs: &HashMap<&str, &View>, finding: &Finding) -> String {
-    let Finding { kind, severity, what, advice, views } = finding;
+fn section(capture: &Capture, views: &HashMap<&str, &View>, finding: &Finding) -> String {
+    let Finding { kind, severity, what, advice, views: named } = finding;
     let mut text = format!(
         "<section class=\"{severity}\"><h3><span>{severity}</span> {kind}</h3>\n<p>{}.</p><p class=\"advice\">{}</p>\n",
         escaped(&capitalised(what)),
         escaped(advice)
     );
-    if !views.is_empty() {
-        text += &format!("<p class=\"names\">{}</p>\n", escaped(&listed(views, NAMES)));
+    if !named.is_empty() {
+        text += &format!("<p class=\"names\">{}</p>\n", escaped(&listed(named, NAMES)));
     }
-    let images = views.iter().filter_map(|name| Some((name, thumbnail(photographs.get(name.as_str())?)?)));
+    let images = named.iter().filter_map(|name| Some((name, thumbnail(capture, views.get(name.as_str())?)?)));
     let figures = images.take(SHOWN).map(|(name, png)| {
         let name = escaped(name);
         format!(
@@ -59,9 +60,11 @@ fn section(photographs: &HashMap<&str, &View>, finding: &Finding) -> String {
     text + &figures.collect::<String>() + "</section>\n"
 }
 
-/// An image as a small PNG; `None` if it cannot be read, which has its own finding.
-fn thumbnail(view: &View) -> Option<String> {
-    let photo = Photo::open(view.image.as_ref()?, None).ok()?;
+/// An image as a small PNG, in the orientation of its camera if it fits; `None` if it cannot be read, which has its own
+/// finding.
+fn thumbnail(capture: &Capture, view: &View) -> Option<String> {
+    let photo =
+        capture.photo(view).or_else(|_| Photo::open(view.image.as_deref().unwrap_or(Path::new("")), None)).ok()?;
     Some(BASE64_STANDARD.encode(photo.at_most(SIDE).over([1.0; 3]).to_png()))
 }
 

@@ -17,7 +17,7 @@ const LENGTH: f64 = 0.1;
 pub struct Pyramid {
     /// Name of its image.
     pub name: String,
-    /// `train`, `test` (held out), or `absent`.
+    /// `train`, `test` (held out), or `absent`, also for images in no split.
     pub kind: &'static str,
     /// True if a warning or an error names it.
     pub flagged: bool,
@@ -67,8 +67,8 @@ impl Stage {
             Pyramid {
                 name: view.name.clone(),
                 kind: match (&view.image, view.split) {
-                    (None, _) => "absent",
-                    (_, Some(Split::Train) | None) => "train",
+                    (None, _) | (_, None) => "absent",
+                    (_, Some(Split::Train)) => "train",
                     _ => "test",
                 },
                 flagged: flagged.contains(&view.name) && view.image.is_some(),

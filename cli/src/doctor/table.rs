@@ -6,6 +6,8 @@ use crate::output::listed;
 
 /// Most image names per finding. The page shows more.
 const NAMES: usize = 6;
+/// Most resolutions and lenses.
+const LISTED: usize = 8;
 /// Columns of a line of advice.
 const WIDTH: usize = 96;
 
@@ -20,10 +22,10 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     let sizes = facts.resolutions.iter().map(|Resolution { width, height, images }| {
         if facts.resolutions.len() == 1 { format!("{width}x{height}") } else { format!("{width}x{height} ({images})") }
     });
-    rows.push(("resolution", joined(sizes)));
+    rows.push(("resolution", some(sizes.collect())));
     rows.extend(facts.focal.map(|focal| ("focal length", format!("{} pixels", range(focal)))));
     rows.extend(facts.field_of_view.map(|view| ("field of view", format!("{} degrees horizontal", range(view)))));
-    rows.push(("lens", joined(facts.lenses.iter().take(4).cloned())));
+    rows.push(("lens", some(facts.lenses.clone())));
     if facts.points > 0 {
         rows.push(("points", facts.points.to_string()));
     }
@@ -43,7 +45,17 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
         } else {
             "good"
         };
-        rows.push(("agreement", format!("{agreement:.2} between images, {word} (0 is chance, 1 is perfect)")));
+        let all: usize = facts.subsets.iter().map(|part| part.present).sum();
+        let of = if facts.compared < all {
+            format!(" of {} of {all} images with neighbours", facts.compared)
+        } else {
+            " between images".to_owned()
+        };
+        rows.push(("agreement", format!("{agreement:.2}{of}, {word} (0 is chance, 1 is perfect)")));
+    } else if facts.compared == 0 {
+        rows.push(("agreement", "not measured: panoramas are not compared".to_owned()));
+    } else {
+        rows.push(("agreement", "not measured: too few patches match".to_owned()));
     }
     rows
 }
@@ -66,6 +78,15 @@ pub fn text(report: &Report) -> String {
         text += &wrapped(advice);
     }
     text + "\n"
+}
+
+/// The first parts of a list, and how many more there are.
+fn some(mut parts: Vec<String>) -> String {
+    if parts.len() > LISTED {
+        let more = parts.split_off(LISTED).len();
+        parts.push(format!("and {more} more"));
+    }
+    parts.join(", ")
 }
 
 fn joined(parts: impl Iterator<Item = String>) -> String {

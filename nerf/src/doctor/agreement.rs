@@ -4,7 +4,7 @@
 //! of patches whose best match is on the epipolar line measures agreement: a fifth by chance, nearly all for right
 //! cameras. Errors such as reflections affect all lines alike.
 
-use super::nearby::usual_gap;
+use super::nearby::{distinct, usual_gap};
 use super::picture::{Patch, Picture};
 use super::poses::Focus;
 use glam::{DAffine3, DMat3, DVec3};
@@ -69,7 +69,8 @@ pub(super) fn compare(all: &[Placed<'_>], of: &[usize]) -> Vec<Pair> {
     let poses: Vec<DAffine3> = all.iter().map(|placed| placed.pose).collect();
     let focus = Focus::of(&poses).filter(|focus| focus.ahead > 0.75);
     let places: Vec<DVec3> = poses.iter().map(|pose| pose.translation).collect();
-    let usual = usual_gap(&places, NEIGHBOURS);
+    // Several images from each place, as the sides of a cube, have neighbours too.
+    let usual = usual_gap(&distinct(&places), NEIGHBOURS);
     let pairs: Vec<[usize; 2]> =
         of.iter().flat_map(|&i| neighbours(&poses, i, usual).into_iter().map(move |j| [i, j])).collect();
     let one = |&[i, j]: &[usize; 2]| {
@@ -191,4 +192,32 @@ fn best_line(transfer: &Transfer<'_>, corner: [f64; 2], patch: &Patch, most: f64
     let fair = counts.iter().all(|count| 2 * count >= longest);
     let others = best[1..].iter().copied().fold(-1.0, f32::max);
     (fair && best[0].max(others) > ALIKE).then_some(best[0] > others)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DQuat;
+    use std::f64::consts::FRAC_PI_2;
+
+    /// Six images from each place, in all directions: the neighbours of each are from the next places, not the first
+    /// ones of the capture.
+    #[test]
+    fn images_from_shared_places_have_near_neighbours() {
+        let place = |i: usize| DVec3::new((i / 6) as f64, 0.1 * (i / 6 % 3) as f64, 0.0);
+        let side = |i: usize| match i % 6 {
+            side @ 0..4 => DQuat::from_rotation_y(side as f64 * FRAC_PI_2),
+            side => DQuat::from_rotation_x((side as f64 - 4.5) * 2.0 * FRAC_PI_2),
+        };
+        let pose = |i: usize| DAffine3::from_rotation_translation(side(i), place(i));
+        let poses: Vec<DAffine3> = (0..300).map(pose).collect();
+        let places: Vec<DVec3> = (0..300).map(place).collect();
+        assert_eq!(distinct(&places).len(), 50);
+        let usual = usual_gap(&distinct(&places), NEIGHBOURS);
+        for i in [0, 7, 150, 299] {
+            let found = neighbours(&poses, i, usual);
+            assert_eq!(found.len(), NEIGHBOURS);
+            assert!(found.iter().all(|j| j % 6 == i % 6 && j.abs_diff(i) <= 6 * NEIGHBOURS), "{i}: {found:?}");
+        }
+    }
 }

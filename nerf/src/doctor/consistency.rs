@@ -2,7 +2,7 @@
 //! poses.
 
 use super::agreement::{Pair, Placed, Tally, compare};
-use super::kinds::FindingKind as Kind;
+use super::kinds::{FindingKind as Kind, Severity};
 use super::order::Order;
 use super::picture::Picture;
 use super::poses::Convention;
@@ -16,7 +16,9 @@ use std::collections::BTreeMap;
 const TRIED: usize = 12;
 /// The fewest matched patches for a verdict.
 const ENOUGH: usize = 100;
-/// The same for a single image, and its least distance from the others in standard deviations.
+/// Fewer matched patches as read count as no agreement when hypotheses are compared with it.
+const SOME: usize = 25;
+/// The fewest for a single image, and its least distance from the others in standard deviations.
 const FEWEST: usize = 8;
 const DEVIATIONS: f64 = 4.0;
 /// The agreement of good cameras.
@@ -44,7 +46,7 @@ pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Fin
     let as_read = placed(&|i| poses[i]);
     let tried = evenly_spaced((0..all.len()).collect(), TRIED);
     let read = total(&compare(&as_read, &tried));
-    let own = if read.trials >= ENOUGH { read.skill() } else { 0.0 };
+    let own = if read.trials >= SOME { read.skill() } else { 0.0 };
     if own < CLEAR {
         let names: Vec<&str> = all.iter().map(|(view, _)| &view.name[..]).collect();
         let conventions = Convention::ALL[1..]
@@ -65,6 +67,10 @@ pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Fin
     }
     if read.trials < ENOUGH {
         return None;
+    }
+    if own > GOOD {
+        // What poses alone suggested is not so.
+        findings.0.retain(|finding| finding.severity == Severity::Error || !is_of_convention(finding.kind));
     }
     if own < NONE && read.trials >= 2 * ENOUGH {
         findings.add(Kind::NoAgreement, &[]);
@@ -87,12 +93,15 @@ fn total(pairs: &[Pair]) -> Tally {
     total
 }
 
+/// Returns true for findings about the convention from poses and points.
+fn is_of_convention(kind: Kind) -> bool {
+    matches!(kind, Kind::LooksAway | Kind::OpenCvAxes | Kind::WorldToCamera)
+}
+
 /// Adds the finding that images match under a hypothesis.
 fn another(hypothesis: Hypothesis, [own, other]: [f64; 2], findings: &mut Findings) {
     // The images decide, so findings from poses alone are obsolete.
-    findings.0.retain(|finding| {
-        !matches!(finding.kind, Kind::LooksAway | Kind::OpenCvAxes | Kind::WorldToCamera | Kind::OnePlace)
-    });
+    findings.0.retain(|finding| !is_of_convention(finding.kind) && finding.kind != Kind::OnePlace);
     let finding = match hypothesis {
         Hypothesis::Order(order) => findings.add(Kind::PoseOrder, &[&order.text()]),
         Hypothesis::Convention(convention) => match convention {

@@ -61,7 +61,7 @@ kinds! {
     /// Images or masks cannot be decoded.
     ImagesUndecodable = "images-undecodable", Error,
         "cannot decode {} (image or mask); the first: {}",
-        "Copy these files again, or remove them from the capture. raygrad reads PNG, JPEG and WebP.";
+        "Copy these files again, or remove them from the capture. raygrad reads PNG, JPEG, WebP, TIFF and BMP.";
     /// Training refuses the capture, for a reason that no other finding states.
     Refused = "refused", Error,
         "training refuses the capture: {}",
@@ -76,9 +76,14 @@ kinds! {
         "Nothing to do: raygrad uses each image at its own resolution.";
     /// A field of view is implausible.
     FieldOfView = "field-of-view", Warning,
-        "the field of view of {} is below 10 or above 150 degrees",
+        "the field of view of {} is below 10 or above 150 degrees (230 with a fisheye lens)",
         "Check the units: focal lengths are in pixels of the listed image, not millimetres; `camera_angle_x` is in \
          radians.";
+    /// Single focal lengths are far from the others.
+    FocalLength = "focal-length", Note,
+        "the focal length of {} is far from that of the other images of the same size",
+        "Nothing to do for images of another zoom or lens. Otherwise the focal length is wrong: calibrate these images \
+         with the others, or remove them.";
     /// Horizontal and vertical focal lengths differ.
     PixelAspect = "pixel-aspect", Warning,
         "the horizontal and vertical focal lengths of {} differ by more than 5 %",
@@ -133,6 +138,11 @@ kinds! {
     Scale = "scale", Warning,
         "the cameras' spacing is {} times their distance from the points of the scene",
         "Give camera positions and points in one unit: one of them may be in millimetres.";
+    /// Depth files cannot be decoded, or do not fit their cameras.
+    DepthsUndecodable = "depths-undecodable", Warning,
+        "cannot use the depths of {}; the first: {}",
+        "Make these files again, or remove them from the capture. Training with --depth-loss stops at them; without it \
+         they are not read.";
     /// Measured depths have another unit than the points.
     DepthUnit = "depth-unit", Warning,
         "measured depths are {} times the distances of the points behind their pixels",

@@ -4,10 +4,10 @@ use super::kinds::{FindingKind as Kind, Severity};
 use super::nearby::{Nearby, usual_gap};
 use super::poses::{Convention, Focus, extents};
 use super::report::{Finding, Findings};
-use crate::camera::Camera;
+use crate::camera::{Camera, Lens};
 use crate::dataset::{Capture, Format, SceneAnalysis, SceneType, Split, View, evenly_spaced};
 use crate::numbers::{mean, median};
-use Severity::{Error, Warning};
+use Severity::{Error, Note, Warning};
 use glam::{DAffine3, DVec3};
 
 /// Fewer images than the first are an error; fewer than the second are a warning.
@@ -30,11 +30,24 @@ pub(super) fn examine(capture: &Capture, analysis: Option<&SceneAnalysis>, findi
     if views.len() < 2 {
         return;
     }
-    let poses: Vec<DAffine3> = views.iter().map(|view| view.camera.pose).collect();
-    let places: Vec<DVec3> = poses.iter().map(|pose| pose.translation).collect();
-    let size = extents(&places);
-    let focus = Focus::of(&poses);
-    let meant = by_points(capture, &views).or_else(|| by_axes(&poses, focus, size[0]));
+    let places: Vec<DVec3> = views.iter().map(|view| view.camera.pose.translation).collect();
+    let far = far_cameras(&places);
+    findings.about(Kind::FarCamera, far.iter().map(|i| views[*i]), &[]);
+    // Far cameras, which are probably wrong, would hide what the others have in common.
+    let of_extents = |poses: &[DAffine3]| extents(&poses.iter().map(|pose| pose.translation).collect::<Vec<_>>());
+    let all: Vec<DAffine3> = views.iter().map(|view| view.camera.pose).collect();
+    let is_near = |i: &usize| far.binary_search(i).is_err();
+    let mut poses: Vec<DAffine3> = (0..views.len()).filter(is_near).map(|i| all[i]).collect();
+    let least = ONE_PLACE * (1.0 + median(places.iter().map(|place| place.length())));
+    if !(of_extents(&poses)[0] > least) {
+        poses = all;
+    }
+    let (size, focus) = (of_extents(&poses), Focus::of(&poses));
+    let meant = by_points(capture, &views).unwrap_or_else(|| {
+        // COLMAP has one convention, and the axes of panoramas are no views.
+        let is_fixed = capture.format == Format::Colmap || views.iter().any(|view| is_panorama(&view.camera));
+        if is_fixed { None } else { by_axes(&poses, focus, size[0]) }
+    });
     if let Some((convention, severity)) = meant {
         let kind = match (convention, severity) {
             (Convention::OpenCv, Error) => Kind::OpenCvAxes,
@@ -43,7 +56,7 @@ pub(super) fn examine(capture: &Capture, analysis: Option<&SceneAnalysis>, findi
         };
         findings.add(kind, &[]).severity = severity;
     }
-    if !(size[0] > ONE_PLACE * (1.0 + median(places.iter().map(|place| place.length())))) {
+    if !(size[0] > least) {
         if !matches!(meant, Some((Convention::WorldToCamera | Convention::WorldToOpenCv, _))) {
             findings.add(Kind::OnePlace, &[]);
         }
@@ -53,16 +66,21 @@ pub(super) fn examine(capture: &Capture, analysis: Option<&SceneAnalysis>, findi
         findings.add(Kind::OnALine, &[]);
     }
     pairs(&views, &places, focus.map_or(size[0], |focus| focus.distance.max(size[0])), size[0], findings);
-    far_cameras(&views, &places, size[0], findings);
     scale(capture, &places, size[0], findings);
     if let Some(analysis) = analysis {
         let up = analysis.transform.rotation.transpose() * DVec3::Z;
         roll(&views, up, findings);
-        if let Some(focus) = focus.filter(Focus::is_inward) {
+        let is_inward = |focus: &Focus| focus.is_inward() && !views.iter().any(|view| is_panorama(&view.camera));
+        if let Some(focus) = focus.filter(is_inward) {
             coverage(&places, focus, up, findings);
         }
         in_the_box(&views, analysis, findings);
     }
+}
+
+/// Returns true if a camera sees all around itself, so that its axes are no view.
+pub(super) fn is_panorama(camera: &Camera) -> bool {
+    camera.lens == Lens::Equirectangular
 }
 
 fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
@@ -71,9 +89,11 @@ fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
         1 => "only 1 image",
         count => &format!("only {count} images"),
     };
-    if views.len() < FEW[1] {
+    // A panorama shows as much as the six sides of a cube.
+    let shown: usize = views.iter().map(|view| if is_panorama(&view.camera) { 6 } else { 1 }).sum();
+    if shown < FEW[1] {
         let finding = findings.add(Kind::FewImages, &[&what]);
-        if views.len() < FEW[0] {
+        if shown < FEW[0] {
             finding.severity = Error;
         }
     }
@@ -82,8 +102,9 @@ fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
     }
 }
 
-/// The convention, other than the one used, under which the capture's points are in the images.
-fn by_points(capture: &Capture, views: &[&View]) -> Option<(Convention, Severity)> {
+/// The convention, other than the one used, under which the capture's points are in the images: `Some(None)` if they are
+/// as it is read, `None` if the points do not tell.
+fn by_points(capture: &Capture, views: &[&View]) -> Option<Option<(Convention, Severity)>> {
     /// The fewest points; the most points and cameras that are used.
     const COUNTS: [usize; 3] = [50, 200, 40];
     if capture.points.len() < COUNTS[0] {
@@ -99,12 +120,12 @@ fn by_points(capture: &Capture, views: &[&View]) -> Option<(Convention, Severity
         seen.sum::<usize>() as f64 / (views.len() * points.len()) as f64
     };
     if share(Convention::AsRead) > 0.05 {
-        return None;
+        return Some(None);
     }
     // Mirrored captures mirror their points too, so points cannot reveal it.
     let others = [Convention::OpenCv, Convention::WorldToCamera, Convention::WorldToOpenCv].map(|c| (share(c), c));
     let (best, convention) = others.into_iter().max_by(|a, b| a.0.total_cmp(&b.0))?;
-    (best > 0.2).then_some((convention, Error))
+    (best > 0.2).then_some(Some((convention, Error)))
 }
 
 /// The convention that the camera axes suggest. It is not proven: cameras inside a room look away from each other too.
@@ -132,17 +153,18 @@ fn pairs(views: &[&View], places: &[DVec3], distance: f64, size: f64, findings: 
     /// The tolerances of equal poses: a share of a length, and radians.
     const SAME: [f64; 2] = [1e-6, 1e-5];
     const NEARLY: [f64; 2] = [1e-3, 3e-3];
-    let is_trained = |i: usize| views[i].split == Some(Split::Train);
+    // Images in no split are not used.
+    let is_in = |i: usize, trained: bool| views[i].split.is_some_and(|split| (split == Split::Train) == trained);
     let turned = |i: usize, j: usize| {
         let [a, b] = [i, j].map(|i| views[i].camera.pose.matrix3);
         (0..3).map(|axis| a.col(axis).distance_squared(b.col(axis))).sum::<f64>()
     };
     // For each image of one set (trained on or held out), an image of another set with the same pose.
     let alike = |of: bool, among: bool, length: f64, [share, angle]: [f64; 2]| -> Vec<[usize; 2]> {
-        let nearby = Nearby::new(places, |i| is_trained(i) == among, share * length);
+        let nearby = Nearby::new(places, |i| is_in(i, among), share * length);
         let is_other = |i: usize, j: usize| of != among || j < i;
         let find = |i: usize| nearby.of(i).find(|&j| is_other(i, j) && turned(i, j) <= 2.0 * angle * angle);
-        (0..views.len()).filter(|i| is_trained(*i) == of).filter_map(|i| Some([i, find(i)?])).collect()
+        (0..views.len()).filter(|i| is_in(*i, of)).filter_map(|i| Some([i, find(i)?])).collect()
     };
     let shown =
         |pairs: Vec<[usize; 2]>| -> Vec<[&View; 2]> { pairs.into_iter().map(|pair| pair.map(|i| views[i])).collect() };
@@ -152,12 +174,13 @@ fn pairs(views: &[&View], places: &[DVec3], distance: f64, size: f64, findings: 
     findings.alike(Kind::Leak, &shown(alike(false, true, distance, NEARLY)));
 }
 
-fn far_cameras(views: &[&View], places: &[DVec3], size: f64, findings: &mut Findings) {
+/// The cameras that are far from all others, in order.
+fn far_cameras(places: &[DVec3]) -> Vec<usize> {
     let middle = DVec3::from([0, 1, 2].map(|axis| median(places.iter().map(|place| place[axis]))));
     let usual = median(places.iter().map(|place| place.distance(middle)));
-    let nearby = Nearby::new(places, |_| true, (8.0 * usual_gap(places, 1)).max(ONE_PLACE * size));
+    let nearby = Nearby::new(places, |_| true, (8.0 * usual_gap(places, 1)).max(ONE_PLACE * (1.0 + middle.length())));
     let far = |i: &usize| places[*i].distance(middle) > 4.0 * usual && nearby.of(*i).all(|j| j == *i);
-    findings.about(Kind::FarCamera, (0..views.len()).filter(far).map(|i| views[i]), &[]);
+    (0..places.len()).filter(far).collect()
 }
 
 fn scale(capture: &Capture, places: &[DVec3], size: f64, findings: &mut Findings) {
@@ -175,7 +198,7 @@ fn scale(capture: &Capture, places: &[DVec3], size: f64, findings: &mut Findings
     if capture.format == Format::Blender && !(1.0..=20.0).contains(&from_origin) {
         findings.0.push(Finding {
             kind: Kind::Scale,
-            severity: Warning,
+            severity: Note,
             what: format!(
                 "the cameras are {from_origin:.3} units from the origin; Blender captures usually use about 4"
             ),
@@ -195,7 +218,7 @@ fn roll(views: &[&View], up: DVec3, findings: &mut Findings) {
     let turned = |view: &&&View| {
         let axes = view.camera.pose.matrix3;
         let level = axes.z_axis.dot(up).abs() < POLE;
-        level && axes.x_axis.dot(up).atan2(axes.y_axis.dot(up)).abs().to_degrees() > ROLL
+        level && !is_panorama(&view.camera) && axes.x_axis.dot(up).atan2(axes.y_axis.dot(up)).abs().to_degrees() > ROLL
     };
     findings.about(Kind::Roll, views.iter().filter(turned).copied(), &[]);
 }

@@ -1,7 +1,7 @@
 //! Measurements of the pixels of one image, from a single read at a small size.
 
 use super::picture::{Picture, grey};
-use crate::dataset::load::same_shape;
+use crate::dataset::load::used_size;
 use crate::dataset::photo::sharpness::laplacian_variance;
 use crate::dataset::{Capture, Image, Photo, View};
 use crate::error::Result;
@@ -56,9 +56,7 @@ pub(super) fn look_at_all<'a>(
 
 fn look_at(view: &View) -> Result<Look> {
     let path = view.image.clone().unwrap_or_default();
-    // As stored if that fits the camera, otherwise as shown.
-    let [stored, shown] = Photo::size_of_file(&path)?;
-    let size = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera));
+    let size = used_size(Photo::size_of_file(&path)?, &view.camera);
     let photo = Photo::open(&path, size)?;
     let unread_profile = Photo::has_unread_profile(&path)?;
     let transparent = photo.has_alpha().then(|| photo.transparent_share() > 0.0);
@@ -67,15 +65,34 @@ fn look_at(view: &View) -> Result<Look> {
     let mask = view.mask_photo(None)?;
     let used = mask
         .as_ref()
-        .map(|mask| mask.pixels().filter(|pixel| pixel[0] >= 0.99).count() as f64 / (mask.width * mask.height) as f64);
+        .map(|mask| mask.pixels().filter(|pixel| is_used(*pixel)).count() as f64 / (mask.width * mask.height) as f64);
     let mut hasher = DefaultHasher::new();
     [photo.width, photo.height].hash(&mut hasher);
     middle.to_image().data.iter().for_each(|value| value.to_bits().hash(&mut hasher));
-    let (luminance, balance) = light(&small.to_image());
     let picture = size.and_then(|_| Picture::new(&view.camera, &small, mask.as_ref()));
-    let sharpness = sharpness(&grey(&middle, mean(&small.to_image())));
+    let [middle, small] = [middle, small].map(|photo| used_alone(&photo, mask.as_ref()));
+    let (luminance, balance) = light(&small);
+    let sharpness = sharpness(&grey(&Photo::from(middle), mean(&small)));
     let hash = hasher.finish();
     Ok(Look { transparent, hollow, unread_profile, hash, sharpness, luminance, balance, used, picture })
+}
+
+/// An image whose pixels are transparent where its mask hides them.
+fn used_alone(photo: &Photo, mask: Option<&Photo>) -> Image {
+    let image = photo.to_image();
+    let Some(mask) = mask else { return image };
+    let Image { width, height, channels, .. } = image;
+    let pixels = image.data.chunks_exact(channels).enumerate().flat_map(|(i, pixel)| {
+        let [x, y] = [i % width * mask.width / width, i / width * mask.height / height];
+        let alpha = if is_used(mask.pixel(x, y)) { pixel.get(3).copied().unwrap_or(1.0) } else { 0.0 };
+        [pixel[0], pixel[1], pixel[2], alpha]
+    });
+    Image { channels: 4, data: pixels.collect(), ..image }
+}
+
+/// Returns true for white pixels of a mask.
+pub(super) fn is_used(pixel: [f32; 4]) -> bool {
+    pixel[0] >= 0.99
 }
 
 /// See [`Look::sharpness`].

@@ -1,7 +1,7 @@
 //! Checks a capture for problems and gives advice, before time is spent on training.
 //!
 //! Start with [`examine`], which reads all images: sharpness, exposure, and agreement with neighbours along epipolar
-//! lines. [`examine_cameras`] checks only poses, lenses and image headers, in milliseconds.
+//! lines. [`examine_cameras`] checks only poses, lenses and image headers.
 
 mod agreement;
 mod consistency;
@@ -30,7 +30,7 @@ use report::Findings;
 /// Options of [`examine`].
 #[derive(Clone, Copy)]
 pub struct DoctorOptions<'a> {
-    /// Maximum number of images, evenly spaced, that are compared with their neighbours. All images are read
+    /// Maximum number of images, evenly spaced, whose agreement with their neighbours is measured. All images are read
     /// regardless.
     pub compared: usize,
     /// Progress callback `(read, total)`, in images; called from several threads.
@@ -53,7 +53,7 @@ pub fn examine_cameras(capture: &Capture, analysis: Result<&SceneAnalysis, &Erro
     if analysis.is_ok_and(|analysis| analysis.hollow) {
         findings.add(FindingKind::HollowAlpha, &[&"most images"]);
     }
-    Report { facts, findings: findings.sorted(analysis.err()) }
+    Report { facts, findings: findings.sorted(refusal(capture, analysis)) }
 }
 
 /// Examines everything that [`examine_cameras`] does and reads all images, in parallel.
@@ -65,10 +65,16 @@ pub fn examine(capture: &Capture, analysis: Result<&SceneAnalysis, &Error>, opti
     depths::examine(capture, &mut findings);
     let seen: Vec<Seen<'_>> =
         looks.iter().filter_map(|(view, look)| Some(Seen { view, look: look.as_ref().ok()? })).collect();
-    pixels::examine(&seen, &mut findings);
-    let compared = seen.iter().filter_map(|one| Some((one.view, one.look.picture.as_ref()?))).collect::<Vec<_>>();
-    facts.agreement = consistency::examine(&compared, options.compared, &mut findings);
-    Report { facts, findings: findings.sorted(analysis.err()) }
+    pixels::examine(&seen, analysis.ok(), &mut findings);
+    let pictures = seen.iter().filter_map(|one| Some((one.view, one.look.picture.as_ref()?))).collect::<Vec<_>>();
+    facts.agreement = consistency::examine(&pictures, options.compared, &mut findings);
+    facts.compared = options.compared.min(pictures.len());
+    Report { facts, findings: findings.sorted(refusal(capture, analysis)) }
+}
+
+/// Why training refuses a capture. That it has no images is a finding of its own.
+fn refusal<'a>(capture: &Capture, analysis: Result<&SceneAnalysis, &'a Error>) -> Option<&'a Error> {
+    analysis.err().filter(|_| capture.present().next().is_some())
 }
 
 fn without_pixels(capture: &Capture, analysis: Option<&SceneAnalysis>, findings: &mut Findings) -> Facts {
@@ -120,6 +126,7 @@ fn without_pixels(capture: &Capture, analysis: Option<&SceneAnalysis>, findings:
             middle: analysis.transform.origin,
         }),
         agreement: None,
+        compared: 0,
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::dataset::evenly_spaced;
 use crate::numbers::median;
 use glam::DVec3;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 /// Points in the cells of a cubic lattice. Memory and time are linear in their number.
 pub(super) struct Nearby<'a> {
@@ -47,6 +47,17 @@ pub(super) fn usual_gap(places: &[DVec3], away: usize) -> f64 {
         gaps.sort_by(f64::total_cmp);
         gaps.get(away).or(gaps.last()).copied().unwrap_or(0.0)
     }))
+}
+
+/// One of the points in each place. Points that differ by rounding alone are in one place, but for a few.
+pub(super) fn distinct(places: &[DVec3]) -> Vec<DVec3> {
+    /// The side of a place, as a share of the extent of all.
+    const PLACE: f64 = 1e-7;
+    let Some(first) = places.first().copied() else { return vec![] };
+    let extent = places.iter().map(|place| place.distance(first)).fold(0.0, f64::max);
+    let side = (PLACE * extent).max(f64::MIN_POSITIVE);
+    let mut taken = HashSet::new();
+    places.iter().copied().filter(|place| taken.insert(cell(*place - first, side))).collect()
 }
 
 /// The cell of a point.

@@ -1,5 +1,6 @@
 //! A small grey pinhole image, undistorted from any lens.
 
+use super::look::is_used;
 use crate::camera::{Camera, Lens};
 use crate::dataset::{Image, Photo};
 
@@ -146,7 +147,7 @@ fn hide(image: &mut Image, mask: &Photo) {
     let Image { width, height, .. } = *image;
     for (i, value) in image.data.iter_mut().enumerate() {
         let [column, row] = [i % width * mask.width / width, i / width * mask.height / height];
-        if mask.pixel(column, row)[0] < 0.99 {
+        if !is_used(mask.pixel(column, row)) {
             *value = f32::NAN;
         }
     }

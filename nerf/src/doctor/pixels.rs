@@ -3,10 +3,11 @@
 use super::kinds::{FindingKind as Kind, Severity};
 use super::look::Look;
 use super::report::Findings;
-use crate::dataset::load::{mask_fits, same_shape};
+use crate::dataset::load::{mask_fits, used_size};
 use crate::dataset::{Capture, EmptyBackground, Photo, SceneAnalysis, SceneType, Split, View};
 use crate::error::Result;
 use crate::numbers::{median, spread};
+use glam::DVec3;
 use std::collections::{HashMap, HashSet};
 
 /// An image and the measurements of its pixels.
@@ -25,6 +26,9 @@ const COLOUR: f64 = 1.2;
 const NEIGHBOURS: usize = 6;
 const AROUND: usize = 1000;
 
+/// The most sizes that a finding lists.
+const LISTED: usize = 8;
+
 /// The sizes of the images, from their headers, the most frequent first.
 pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 2], usize)> {
     let mut counts: HashMap<[usize; 2], usize> = HashMap::new();
@@ -32,8 +36,7 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
     let (mut masks, mut first_mask) = (vec![], String::new());
     for view in capture.present() {
         let Some(Ok([stored, shown])) = view.image.as_ref().map(Photo::size_of_file) else { continue };
-        // As stored if that fits the camera, otherwise as shown.
-        let used = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera));
+        let used = used_size([stored, shown], &view.camera);
         *counts.entry(used.unwrap_or(shown)).or_default() += 1;
         if view.camera.width > 0 && used.is_none() {
             if shapes.is_empty() {
@@ -55,18 +58,26 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
     let mut counts: Vec<_> = counts.into_iter().collect();
     counts.sort_by_key(|(size, count)| (std::cmp::Reverse(*count), *size));
     if counts.len() > 1 {
-        let listed: Vec<String> = counts.iter().map(|([w, h], n)| format!("{n} of {w}x{h}")).collect();
+        let mut listed: Vec<String> = counts.iter().take(LISTED).map(|([w, h], n)| format!("{n} of {w}x{h}")).collect();
+        if counts.len() > LISTED {
+            listed.push(format!("and {} more", counts.len() - LISTED));
+        }
         findings.add(Kind::MixedResolutions, &[&listed.join(", ")]);
     }
     counts
 }
 
-/// Adds a finding about images without an alpha channel among those that show an object on a transparent background.
-pub(super) fn without_alpha(capture: &Capture, analysis: Option<&SceneAnalysis>, findings: &mut Findings) {
-    let is_cut = |analysis: &&SceneAnalysis| {
+/// Returns true if the images show an object on a transparent background.
+fn is_cutout(analysis: Option<&SceneAnalysis>) -> bool {
+    let is_cut = |analysis: &SceneAnalysis| {
         analysis.scene_type == SceneType::Bounded && analysis.empty == Some(EmptyBackground::Transparent)
     };
-    if analysis.filter(is_cut).is_none() {
+    analysis.is_some_and(is_cut)
+}
+
+/// Adds a finding about images without an alpha channel among those that show an object on a transparent background.
+pub(super) fn without_alpha(capture: &Capture, analysis: Option<&SceneAnalysis>, findings: &mut Findings) {
+    if !is_cutout(analysis) {
         return;
     }
     let has_alpha = |view: &View| Photo::file_has_alpha(view.image.as_ref()?).ok();
@@ -86,12 +97,12 @@ pub(super) fn unreadable(looks: &[(&View, Result<Look>)], findings: &mut Finding
 }
 
 /// Adds findings about images that can be decoded.
-pub(super) fn examine(seen: &[Seen<'_>], findings: &mut Findings) {
+pub(super) fn examine(seen: &[Seen<'_>], analysis: Option<&SceneAnalysis>, findings: &mut Findings) {
     duplicates(seen, findings);
     blurred(seen, findings);
     light(seen, findings);
     masks(seen, findings);
-    alpha(seen, findings);
+    alpha(seen, is_cutout(analysis), findings);
     let unread = seen.iter().filter(|one| one.look.unread_profile);
     findings.about(Kind::ColorProfile, unread.map(|one| one.view), &[]);
 }
@@ -112,13 +123,23 @@ fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
             first.insert(look.hash, view);
             continue;
         };
-        let across = (view.split == Some(Split::Train)) != (other.split == Some(Split::Train));
-        if across { leaks.push([*view, *other]) } else { same.push([*view, *other]) }
+        let is_trained = [*view, *other].map(|view| view.split.map(|split| split == Split::Train));
+        match is_trained {
+            [Some(true), Some(false)] => leaks.push([*other, *view]),
+            [Some(false), Some(true)] => leaks.push([*view, *other]),
+            // Images in no split are not used.
+            _ => same.push([*view, *other]),
+        }
     }
     findings.alike(Kind::DuplicateImages, &same);
-    if !findings.0.iter().any(|finding| finding.kind == Kind::Leak) {
-        findings.alike(Kind::Leak, &leaks);
-    }
+    let known: HashSet<String> = findings
+        .0
+        .iter()
+        .filter(|finding| finding.kind == Kind::Leak)
+        .flat_map(|finding| finding.views.clone())
+        .collect();
+    leaks.retain(|[view, _]| !known.contains(&view.name));
+    findings.alike(Kind::Leak, &leaks);
 }
 
 /// The difference of each value from the median of its neighbours. A value that all neighbours share is not a fault.
@@ -126,7 +147,8 @@ fn residuals(seen: &[Seen<'_>], value: impl Fn(&Look) -> Option<f64>) -> Vec<Opt
     let values: Vec<Option<f64>> = seen.iter().map(|one| value(one.look)).collect();
     let pose = |i: usize| seen[i].view.camera.pose;
     let gap = |i: usize, j: usize| pose(i).translation.distance(pose(j).translation);
-    let usual = median((0..seen.len()).map(|i| gap(i, 0))).max(f64::MIN_POSITIVE);
+    let middle = DVec3::from([0, 1, 2].map(|axis| median((0..seen.len()).map(|i| pose(i).translation[axis]))));
+    let usual = median((0..seen.len()).map(|i| pose(i).translation.distance(middle))).max(f64::MIN_POSITIVE);
     let residual = |i: usize| {
         let own = values[i]?;
         // The nearest so far, in order of distance.
@@ -182,7 +204,7 @@ fn masks(seen: &[Seen<'_>], findings: &mut Findings) {
     findings.about(Kind::MaskHidesNothing, with(1.0), &[]);
 }
 
-fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
+fn alpha(seen: &[Seen<'_>], is_cutout: bool, findings: &mut Findings) {
     let with = |transparent| seen.iter().filter(move |one| one.look.transparent == Some(transparent));
     let hollow: Vec<&View> = seen.iter().filter(|one| one.look.hollow).map(|one| one.view).collect();
     // A ring or a window may surround single images.
@@ -190,8 +212,11 @@ fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
         findings.about(Kind::HollowAlpha, hollow, &[]);
     }
     let opaque = findings.about(Kind::OpaqueAlpha, with(false).map(|one| one.view), &[]);
+    // Of other scenes, undistortion may have cleared corners.
+    let [clear, full] = [true, false].map(|transparent| with(transparent).count());
     if let Some(finding) = opaque
-        && with(true).next().is_some()
+        && is_cutout
+        && full < clear
     {
         finding.severity = Severity::Warning;
         finding.advice = Kind::NoAlpha.text().advice.to_owned();
@@ -276,7 +301,7 @@ mod tests {
         let looks = look_at_all(&capture, &|_, _| {});
         let seen: Vec<_> = looks.iter().map(|(view, look)| Seen { view, look: look.as_ref().unwrap() }).collect();
         let mut findings = Findings::default();
-        examine(&seen, &mut findings);
+        examine(&seen, None, &mut findings);
         let [found] = &findings.sorted(None)[..] else { panic!("not one finding") };
         assert_eq!((found.kind, &found.views[..]), (Kind::ColorProfile, &["1".to_owned()][..]));
         assert_eq!(found.what, "cannot read the colour profile of 1 image; colours count as sRGB");
@@ -285,7 +310,7 @@ mod tests {
     #[test]
     fn residuals_are_from_the_median_of_the_nearest() {
         let mut rng = Pcg64Mcg::seed_from_u64(5);
-        for count in [3, 4, 9, 40, 2500] {
+        for count in [3_usize, 4, 9, 40, 2500] {
             let mut number = || rng.random::<f64>();
             let views: Vec<View> = (0..count)
                 .map(|i| {
@@ -310,7 +335,9 @@ mod tests {
             let seen: Vec<Seen<'_>> = views.iter().zip(&looks).map(|(view, look)| Seen { view, look }).collect();
             let pose = |i: usize| -> DAffine3 { views[i].camera.pose };
             let gap = |i: usize, j: usize| pose(i).translation.distance(pose(j).translation);
-            let usual = median((0..count).map(|i| gap(i, 0)));
+            let places = || views.iter().map(|view| view.camera.pose.translation);
+            let middle = DVec3::from([0, 1, 2].map(|axis| median(places().map(|place| place[axis]))));
+            let usual = median(places().map(|place| place.distance(middle)));
             let found = residuals(&seen, |look| look.sharpness);
             for i in (0..count).step_by(count.div_ceil(60)) {
                 // All images in the range of the search, in order.

@@ -102,6 +102,10 @@ pub struct Facts {
     /// Agreement of images with their cameras along epipolar lines: 0 is chance, 1 is perfect, 0.3 is usual in a good
     /// capture. `None` if it was not measured or too few patches match.
     pub agreement: Option<f64>,
+    /// Number of images that were compared with their neighbours for it; 0 if pixels were not read. Panoramas are not
+    /// compared.
+    #[serde(default)]
+    pub compared: usize,
 }
 
 /// The result of an examination.
@@ -128,9 +132,6 @@ impl Report {
 /// Collects findings.
 #[derive(Debug, Default)]
 pub(super) struct Findings(pub Vec<Finding>);
-
-/// Findings that are the reason of a refusal.
-const STATED: [FindingKind; 3] = [FindingKind::ImagesAbsent, FindingKind::FewImages, FindingKind::OnePlace];
 
 impl Findings {
     /// Adds a finding; `parts` take the places of `{}` in the message of its kind.
@@ -172,10 +173,10 @@ impl Findings {
     }
 
     /// Sorts them: the most severe first, then in the order of their kinds. Adds why training refuses the capture,
-    /// unless a finding says it.
+    /// unless it is that all cameras stand in one place.
     pub fn sorted(mut self, refusal: Option<&Error>) -> Vec<Finding> {
         if let Some(error) = refusal
-            && !self.0.iter().any(|finding| finding.severity == Severity::Error && STATED.contains(&finding.kind))
+            && !self.0.iter().any(|finding| finding.kind == FindingKind::OnePlace)
         {
             self.add(FindingKind::Refused, &[error]);
         }

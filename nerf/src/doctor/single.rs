@@ -4,6 +4,8 @@ use super::kinds::FindingKind as Kind;
 use super::report::Findings;
 use crate::camera::{Camera, Lens};
 use crate::dataset::Capture;
+use crate::numbers::median;
+use std::collections::HashMap;
 
 /// Plausible fields of view in degrees, and the largest of fisheye lenses.
 const VIEWS: [f64; 2] = [10.0, 150.0];
@@ -14,6 +16,10 @@ const ASPECT: f64 = 0.05;
 const OFF_CENTRE: f64 = 0.1;
 /// The distortion at the border, in degrees, above which a lens is reported as strong.
 const BENDS: f64 = 5.0;
+/// The largest usual ratio of two focal lengths, and the largest share of images of one size beyond it that is
+/// reported: more may have another zoom or lens.
+const ZOOM: f64 = 1.3;
+const RARE: f64 = 0.1;
 /// Points tested along a line from the principal point to the border.
 const STEPS: usize = 32;
 
@@ -31,12 +37,34 @@ pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
         let [x, y] = camera.focal;
         camera.lens != Lens::Equirectangular && !((x / y - 1.0).abs() <= ASPECT)
     });
+    let usual = usual_focals(capture);
+    about(Kind::FocalLength, &|camera| {
+        let (Some((focals, usual)), focal) = (usual.get(&[camera.width, camera.height]), camera.focal[0]) else {
+            return false;
+        };
+        let is_other = |focal: f64| !(1.0 / ZOOM..=ZOOM).contains(&(focal / usual));
+        let others = focals.iter().filter(|focal| is_other(**focal)).count();
+        is_other(focal) && others as f64 <= RARE * focals.len() as f64
+    });
     about(Kind::PrincipalPoint, &|camera| {
         let sides = [camera.width as f64, camera.height as f64];
         (0..2).any(|axis| !((camera.centre[axis] / sides[axis] - 0.5).abs() <= OFF_CENTRE))
     });
     about(Kind::LensFolds, &|camera| !reaches(camera));
     about(Kind::StrongDistortion, &|camera| reaches(camera) && bends(camera) > BENDS);
+}
+
+/// The horizontal focal lengths of the images of each size, and their median.
+fn usual_focals(capture: &Capture) -> HashMap<[usize; 2], (Vec<f64>, f64)> {
+    let mut of_size: HashMap<[usize; 2], Vec<f64>> = HashMap::new();
+    for camera in capture.views.iter().map(|view| &view.camera) {
+        of_size.entry([camera.width, camera.height]).or_default().push(camera.focal[0]);
+    }
+    let with_median = |focals: Vec<f64>| {
+        let usual = median(focals.iter().copied());
+        (focals, usual)
+    };
+    of_size.into_iter().map(|(size, focals)| (size, with_median(focals))).collect()
 }
 
 /// The horizontal (`axis` 0) or vertical field of view in degrees, without distortion.
