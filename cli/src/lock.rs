@@ -3,6 +3,7 @@
 use std::fs::{File, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use raygrad::nerf::{Error, Result, write_atomic};
 
@@ -10,6 +11,10 @@ use super::output::{complain, remove};
 
 /// Lock file of a program that writes all results of a folder.
 pub const UNFINISHED: &str = "unfinished.lock";
+
+/// How often, and after which pause, a lock that is taken is tried again.
+const ASKED: usize = 5;
+const PAUSE: Duration = Duration::from_millis(20);
 
 /// Exclusive access to a folder, until this is dropped or the program ends.
 ///
@@ -57,7 +62,16 @@ impl Lock {
     ) -> Result<Self> {
         let bad = |e: std::io::Error| Error::file(path, format!("cannot be locked: {e}"));
         let file = File::options().create(true).truncate(false).write(true).open(path).map_err(bad)?;
-        match try_lock(&file) {
+        let mut locked = try_lock(&file);
+        for _ in 0..ASKED {
+            // Another program may be asking, which takes an instant.
+            if matches!(locked, Err(TryLockError::WouldBlock)) {
+                std::thread::sleep(PAUSE);
+                locked = try_lock(&file);
+            }
+        }
+        match locked {
+            Ok(()) if !path.exists() => return Err(busy()),
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => return Err(busy()),
             Err(TryLockError::Error(e)) => complain(&format!(
@@ -78,9 +92,10 @@ impl Lock {
 
     /// Returns true if another program has locked the file.
     pub fn is_taken(path: &Path) -> bool {
-        // Network file systems lock files only that are open for writing.
-        let file = File::options().write(true).open(path).or_else(|_| File::open(path));
-        file.is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
+        // A shared lock, so that programs that ask at one time do not take each other for an owner. Some network file
+        // systems lock files only that are open for writing.
+        let file = File::options().read(true).write(true).open(path).or_else(|_| File::open(path));
+        file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
     }
 
     /// The state of the lock.
@@ -97,7 +112,8 @@ impl Lock {
 
     /// Releases the folder and removes the files of the lock.
     pub fn remove(self) {
-        remove(&[self.path.clone(), owner_of(&self.path)]);
+        // The owner's file first: it may be another's as soon as the lock's file is gone.
+        remove(&[owner_of(&self.path), self.path.clone()]);
     }
 }
 
@@ -124,6 +140,29 @@ mod tests {
         assert_eq!(second.state(), State::Kept);
         second.remove();
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    /// Shards that begin at one time ask for the lock of all, which none of them holds.
+    #[test]
+    fn asking_does_not_look_like_owning() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("lock");
+        File::create(&path).unwrap();
+        let asking = || (0..2000).filter(|_| Lock::is_taken(&path)).count();
+        std::thread::scope(|scope| {
+            let others: Vec<_> = (0..3).map(|_| scope.spawn(asking)).collect();
+            assert!(others.into_iter().all(|other| other.join().unwrap() == 0));
+        });
+        // Nor does it keep an owner from taking it.
+        let asks = File::open(&path).unwrap();
+        asks.lock_shared().unwrap();
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                std::thread::sleep(PAUSE);
+                asks.unlock().unwrap();
+            });
+            take(&path).unwrap();
+        });
     }
 
     #[test]

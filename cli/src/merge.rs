@@ -64,15 +64,20 @@ pub fn merge_if_complete(at: &Path, shard: Shard) -> Work<()> {
 
 /// Merges the shards of ranks, all of which are complete. On a network file system, some may show a little later.
 fn merge_ranks(at: &Path) -> Work<()> {
-    for _ in 0..20 {
-        match shard::progress(at)? {
+    /// Looks, half a second apart. Clients of NFS may not look at a folder again for a minute.
+    const LOOKS: usize = 150;
+    let mut rest = String::new();
+    for _ in 0..LOOKS {
+        rest = match shard::progress(at)? {
             Progress::Complete(complete) => return merge(*complete),
-            Progress::Merging => break,
-            Progress::None | Progress::Incomplete(_) => std::thread::sleep(Duration::from_millis(500)),
-        }
+            Progress::Merging => "; another raygrad merges them".into(),
+            Progress::None => "; there are none".into(),
+            Progress::Incomplete(missing) => format!("; still missing {missing}"),
+        };
+        std::thread::sleep(Duration::from_millis(500));
     }
     let what = format!(
-        "does not show the results of all ranks: use a file system that all share, or run `raygrad merge {}` later",
+        "does not show the results of all ranks{rest}: use a file system that all share, or run `raygrad merge {}` later",
         quoted(at)
     );
     Err(Error::file(at, what).into())

@@ -119,7 +119,12 @@ pub fn take() -> Option<Box<dyn Exchange>> {
 
 /// Gives all ranks the value of rank 0, which is `Some` there.
 pub fn of_first<T: Serialize + DeserializeOwned>(exchange: &mut dyn Exchange, value: Option<&T>) -> Result<T, Error> {
-    let broken = |error| Error::setting("mpi", format!("rank 0 has sent what this rank cannot read: {error}"));
+    let broken = |error| {
+        Error::setting(
+            "mpi",
+            format!("rank 0 has sent what this rank cannot read ({error}): use one version of raygrad"),
+        )
+    };
     let bytes = value.map_or(Ok(vec![]), serde_json::to_vec).map_err(broken)?;
     let bytes = bytes_of_first(exchange, &bytes)?;
     serde_json::from_slice(&bytes).map_err(broken)
@@ -127,8 +132,29 @@ pub fn of_first<T: Serialize + DeserializeOwned>(exchange: &mut dyn Exchange, va
 
 /// Gives all ranks the bytes of rank 0. Those of others are ignored.
 pub fn bytes_of_first(exchange: &mut dyn Exchange, bytes: &[u8]) -> Result<Vec<u8>, Error> {
-    let bytes = if exchange.rank() == 0 { bytes } else { &[] };
-    Ok(exchange.all_gather(bytes).map_err(failed)?.swap_remove(0))
+    /// Bytes of a message. MPI sends less than 2^31.
+    const MESSAGE: usize = 1 << 30;
+    in_messages(exchange, bytes, MESSAGE)
+}
+
+/// [`bytes_of_first`] in messages of this many bytes.
+fn in_messages(exchange: &mut dyn Exchange, bytes: &[u8], message: usize) -> Result<Vec<u8>, Error> {
+    let own = |bytes| if exchange.rank() == 0 { bytes } else { &[][..] };
+    let bytes = own(bytes);
+    let mut first = |bytes: &[u8]| Ok::<_, Error>(exchange.all_gather(bytes).map_err(failed)?.swap_remove(0));
+    let mut received = first(&bytes.len().to_le_bytes())?;
+    let length = received[..].try_into().map(usize::from_le_bytes);
+    let length = length.map_err(|_| Error::setting("mpi", "rank 0 has sent what this rank cannot read"))?;
+    received.clear();
+    while received.len() < length {
+        let start = received.len().min(bytes.len());
+        let part = first(&bytes[start..bytes.len().min(start + message)])?;
+        if part.is_empty() {
+            return Err(Error::setting("mpi", "rank 0 has sent less than it announced"));
+        }
+        received.extend(part);
+    }
+    Ok(received)
 }
 
 /// Whether one of the ranks of a run that has ended was interrupted.
@@ -159,6 +185,23 @@ pub fn fail(code: u8) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn bytes_of_the_first_come_in_messages() {
+        for length in [0, 1, 6, 7, 8, 20] {
+            let sent: Vec<u8> = (0..length).collect();
+            std::thread::scope(|scope| {
+                for mut rank in raygrad::nn::InProcess::ranks(3) {
+                    let sent = &sent;
+                    scope.spawn(move || {
+                        // What others give is ignored.
+                        let own = if rank.rank() == 0 { &sent[..] } else { &[9; 40][..] };
+                        assert_eq!(&in_messages(&mut rank, own, 7).unwrap(), sent);
+                    });
+                }
+            });
+        }
+    }
 
     #[test]
     fn launchers_tell_the_number_of_processes() {

@@ -120,7 +120,13 @@ impl Part {
         let lock = Lock::take(&folder.join(shard.file("lock")), || {
             Error::file(at, format!("another raygrad works on shard {shard}: wait until it ends"))
         })?;
-        let left = records(at)?.remove(&shard.number);
+        // Another job may have begun the shard since.
+        let mut there = records(at)?;
+        if let Err(error) = record.check(at, &there) {
+            lock.remove();
+            return Err(error);
+        }
+        let left = there.remove(&shard.number);
         let is_new = left.is_none();
         record.done = left.map_or(0, |left| left.done);
         let part = Part { folder, shard, record, lock };
@@ -233,7 +239,12 @@ fn records(at: &Path) -> Result<BTreeMap<usize, Record>> {
     if !folder.is_dir() {
         return Ok(all);
     }
-    for path in entries(&folder)? {
+    let found = match entries(&folder) {
+        // Another program has just merged them.
+        Err(_) if !folder.is_dir() => return Ok(all),
+        found => found?,
+    };
+    for path in found {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let number = name.strip_prefix("shard-").and_then(|rest| rest.strip_suffix(".json"));
         let Some(number) = number.and_then(|number| number.parse().ok()).filter(|n| (1..=MOST).contains(n)) else {
@@ -345,6 +356,8 @@ pub fn progress(at: &Path) -> Result<Progress> {
     let path = at.join(UNFINISHED);
     let lock = match Lock::take(&path, || Error::file(at, "another raygrad merges its shards: wait until it ends")) {
         Err(_) if Lock::is_taken(&path) => return Ok(Progress::Merging),
+        // Its owner has just ended.
+        Err(_) if records(at)?.is_empty() => return Ok(Progress::None),
         lock => lock?,
     };
     // Another program may have merged them before the lock, or begun others.

@@ -36,6 +36,8 @@ pub struct Watch<'a> {
     lock: Lock,
     /// True if another program owns the run's folder or its path. Nothing is written then.
     lost: bool,
+    /// Step of the last checkpoint, if it was written after the start.
+    saved: Option<u64>,
     budget: Budget,
     preview: Preview,
     metrics: Journal,
@@ -87,6 +89,7 @@ impl<'a> Watch<'a> {
             run,
             lock,
             lost: false,
+            saved: None,
             budget,
             preview,
             metrics,
@@ -176,9 +179,11 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// Writes a checkpoint of a run that another rank has stopped after its last step.
+    /// Writes a checkpoint of a run that was stopped after its last step, by another rank or between two looks at the
+    /// signal, unless that step has one.
     pub fn stop(&mut self, trainer: &Trainer) {
-        if !trainer.stats().ends_diverged() {
+        let stats = trainer.stats();
+        if self.saved != Some(stats.step) && !stats.ends_diverged() {
             self.attempt(|watch| watch.save(trainer, false));
         }
     }
@@ -193,6 +198,7 @@ impl<'a> Watch<'a> {
         self.flush();
         self.keep()?;
         checkpoint::save(self.run, trainer)?;
+        self.saved = Some(trainer.stats().step);
         self.keep()?;
         self.summarise(&trainer.stats(), None)
     }
@@ -212,7 +218,7 @@ impl<'a> Watch<'a> {
         let what = format!("raygrad: warning: training diverged by step {end}: its values are not finite{reason}");
         match &back {
             Ok(()) => {
-                self.back = Some(step);
+                (self.back, self.saved) = (Some(step), None);
                 self.account.retreat();
                 self.progress.note(&format!("{what}; resuming from step {step} with {SLOWER} times the learning rate"));
             }

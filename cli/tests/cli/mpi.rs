@@ -36,11 +36,23 @@ fn process(job: &Child, rank: usize) -> Option<String> {
     children.lines().find(is_it).map(str::to_owned)
 }
 
-/// Starts a long training on ranks, and sends a signal to one of them when it has saved a checkpoint.
+/// The steps of the checkpoints of a run.
+fn checkpoints(place: &Place) -> Vec<u64> {
+    let files = std::fs::read_dir(place.path("run/checkpoints")).into_iter().flatten().flatten();
+    let names = files.map(|file| file.file_name().to_string_lossy().into_owned());
+    names.filter_map(|name| name.strip_suffix(".checkpoint")?.parse().ok()).collect()
+}
+
+/// Starts a long training on ranks, and sends a signal to one of them when it has trained and, if it is to save
+/// checkpoints every second, saved one.
 fn disturbed(place: &Place, arguments: &str, rank: usize, signal: &str) -> Output {
     let mut job = on_ranks(place, 2, &format!("train scene {SMALL} --out run {arguments}")).spawn().unwrap();
     let metrics = place.path("run/metrics.jsonl");
-    wait(&mut job, || std::fs::metadata(&metrics).is_ok_and(|file| file.len() > 0));
+    let saves = arguments.contains("--checkpoint-every 1s");
+    wait(&mut job, || {
+        let has_saved = !saves || checkpoints(place).into_iter().any(|step| step > 0);
+        has_saved && std::fs::metadata(&metrics).is_ok_and(|file| file.len() > 0)
+    });
     let process = process(&job, rank).unwrap();
     assert!(Command::new("kill").args([format!("-{signal}"), process]).status().unwrap().success());
     job.wait_with_output().unwrap()
@@ -107,9 +119,29 @@ fn dead_and_hung_ranks_end_the_job_with_the_last_checkpoint() {
         let place = Place::with_scene();
         let output = disturbed(&place, arguments, 1, signal);
         assert!(!output.status.success() && said(&output).contains(expected), "{signal}: {}", said(&output));
+        let last = checkpoints(&place).into_iter().max().unwrap();
         let printed = place.succeeds("train --resume run --budget 1s");
-        assert!(printed.contains("resumed  at step "), "{printed}");
+        assert!(printed.contains(&format!("resumed  at step {last}")) && last > 0, "{printed}");
     }
+}
+
+/// The same command works when the rank has what it lacked.
+#[test]
+fn ranks_that_cannot_begin_leave_no_run() {
+    let [place, other] = [0, 1].map(|_| Place::with_scene());
+    let image = std::fs::read_dir(other.path("scene/train")).unwrap().next().unwrap().unwrap().path();
+    std::fs::remove_file(image).unwrap();
+    let train = format!("train scene --steps 3 {SMALL} --out run");
+    let mut ranks = Command::new("mpirun");
+    ranks.args(["--allow-run-as-root", "--oversubscribe", "--bind-to", "none"]);
+    for (i, place) in [&place, &other].into_iter().enumerate() {
+        ranks.args(&[":", "-n", "1", "--wdir"][usize::from(i == 0)..]).arg(place.path(""));
+        ranks.arg(env!("CARGO_BIN_EXE_raygrad")).args(train.split_whitespace());
+    }
+    let output = ranks.output().unwrap();
+    assert!(!output.status.success() && said(&output).contains("raygrad: rank 1: "), "{}", said(&output));
+    assert!(!place.path("run").exists());
+    succeeds(&place, 2, &train);
 }
 
 #[test]
@@ -119,6 +151,7 @@ fn errors_of_a_rank_end_all() {
     assert!(!output.status.success() && said(&output).contains("raygrad: rank 0: missing:"), "{}", said(&output));
     let output = on_ranks(&place, 2, "train scene --steps 3 --port 8000").output().unwrap();
     assert_eq!(said(&output).matches("--host and --port need --view").count(), 1, "{}", said(&output));
+    let place = Place::with_run();
     let output = on_ranks(&place, 2, "eval run --json").output().unwrap();
-    assert!(!output.status.success(), "{output:?}");
+    assert!(!output.status.success() && said(&output).contains("--json"), "{output:?}");
 }
