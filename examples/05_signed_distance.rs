@@ -41,9 +41,9 @@ fn exact_distance(border: &[[f32; 2]], at: [f32; 2]) -> f32 {
 
 /// The distances `[n, 1]` of positions `[n, 2]`: those from a circle, which settles what is inside, and what the network
 /// adds to them.
-fn distance<'t>(network: &Sequential<f32>, params: &Bound<'t, f32>, x: &Var<'t, f32>) -> Var<'t, f32> {
+fn distance<'t>(network: &Sequential<f32>, params: &Bound<'t, f32>, x: &Var<'t, f32>, mode: Mode) -> Var<'t, f32> {
     let circle = (x.square().sum_over(Axes::from(1).keepdims()) + 1e-4).sqrt() - 0.6;
-    circle + network.forward(params, x, Mode::Evaluate)
+    circle + network.forward(params, x, mode)
 }
 
 /// Distances, and the lengths of their gradients by position, which are on the graph too.
@@ -51,8 +51,9 @@ fn distance_and_slope<'t>(
     network: &Sequential<f32>,
     params: &Bound<'t, f32>,
     x: &Var<'t, f32>,
+    mode: Mode,
 ) -> (Var<'t, f32>, Var<'t, f32>) {
-    let d = distance(network, params, x);
+    let d = distance(network, params, x, mode);
     // Each distance depends on its own position only, so the gradient of the sum holds that of each.
     let slope = d.sum().grad_graph(&[x]).remove(0).norm_over(1);
     (d, slope)
@@ -93,7 +94,7 @@ fn main() -> raygrad::nerf::Result<()> {
         let points = Tensor::from_vec(&[2 * BATCH, 2], on_curve.iter().copied().chain(anywhere).collect());
         let tape = Tape::with_pool(pool.clone());
         let bound = params.bind(&tape);
-        let (d, slope) = distance_and_slope(&network, &bound, &tape.leaf(points));
+        let (d, slope) = distance_and_slope(&network, &bound, &tape.leaf(points), Mode::Train(step));
         let on_curve = d.slice_axis(0, 0..BATCH).abs().mean();
         let eikonal = (slope - 1.0).square().mean();
         if step % (STEPS / 6) == 0 {
@@ -112,7 +113,7 @@ fn main() -> raygrad::nerf::Result<()> {
     for rows in pixels.chunks(10 * PIXELS) {
         let tape = Tape::with_pool(pool.clone());
         let x = tape.leaf(Tensor::from_vec(&[rows.len(), 2], rows.concat()));
-        let (d, length) = distance_and_slope(&network, &params.bind_constant(&tape), &x);
+        let (d, length) = distance_and_slope(&network, &params.bind_constant(&tape), &x, Mode::Evaluate);
         found.extend_from_slice(d.value().as_slice());
         slope.extend_from_slice(length.value().as_slice());
     }

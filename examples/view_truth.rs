@@ -28,6 +28,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     let about: Value = serde_json::from_str(&std::fs::read_to_string(Path::new(&run).join("config.json"))?)?;
     let config: Config = serde_json::from_value(about["config"].clone())?;
     let extent: SceneBox = serde_json::from_value(about["scene_box"].clone())?;
+    if about["scene"] != "embedded" {
+        return Err("the run is not of the built-in scene, so its truth is not known".into());
+    }
     let model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
     let scene = Scene::bulldozer();
 
@@ -50,6 +53,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             }
         }
     }
+    if depths.is_empty() {
+        return Err("no pixel shows more of the model than of the background: train it longer".into());
+    }
     println!("{} pixels of {VIEWS} views of {SIZE}x{SIZE}", depths.len());
     println!("                              median      mean");
     row("depth off by, scene units", &mut depths);
@@ -61,7 +67,8 @@ fn main() -> Result<(), Box<dyn Error>> {
 fn row(name: &str, values: &mut [f64]) {
     values.sort_by(f64::total_cmp);
     let mean = values.iter().sum::<f64>() / values.len() as f64;
-    println!("{name:26}{:10.4}{mean:10.4}", values[values.len() / 2]);
+    let median = values.get(values.len() / 2).copied().unwrap_or(f64::NAN);
+    println!("{name:26}{median:10.4}{mean:10.4}");
 }
 
 fn vector(image: &Image, x: usize, y: usize) -> DVec3 {

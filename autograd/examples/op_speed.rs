@@ -63,7 +63,9 @@ const FUNCTIONS: [(&str, Call); 48] = [
 ];
 
 /// Nanoseconds an element, forward, and backward from the sum of all results: the fastest of several runs.
-fn time(shape: &[usize], [low, high]: [f32; 2], call: Call) -> [f64; 2] {
+///
+/// With `of_all`, backward is by the second operand too.
+fn time(shape: &[usize], [low, high]: [f32; 2], call: Call, of_all: bool) -> [f64; 2] {
     let value = Tensor::from_fn(shape, |i| ((i * 7919) % 1013) as f32 / 1013.0 * (high - low) + low);
     let n = shape[shape.len() - 1];
     let row = Tensor::full(&[n], 0.5);
@@ -72,13 +74,15 @@ fn time(shape: &[usize], [low, high]: [f32; 2], call: Call) -> [f64; 2] {
     for _ in 0..20 + 40_000_000 / value.len().max(1_000_000) {
         let tape = Tape::with_pool(pool.clone());
         let x = tape.leaf(value.clone());
-        let rest = [tape.leaf(row.clone()), tape.leaf(row.clone()), tape.constant(other.clone())];
+        let second = if of_all { tape.leaf(other.clone()) } else { tape.constant(other.clone()) };
+        let rest = [tape.leaf(row.clone()), tape.leaf(row.clone()), second];
+        let wrt = [&x, &rest[0], &rest[1], &rest[2]];
         let start = Instant::now();
         let y = call(&x, &rest);
         let forward = start.elapsed();
         let sum = y.sum();
         let start = Instant::now();
-        let _grads = sum.backward(&[&x, &rest[0], &rest[1]]);
+        let _grads = sum.backward(&wrt[..if of_all { 4 } else { 3 }]);
         let backward = start.elapsed();
         for (best, time) in best.iter_mut().zip([forward, backward]) {
             *best = best.min(time.as_nanos() as f64 / value.len() as f64);
@@ -91,7 +95,7 @@ fn main() -> Result<(), rayon::ThreadPoolBuildError> {
     rayon::ThreadPoolBuilder::new().num_threads(1).build_global()?;
     if std::env::args().any(|argument| argument == "functions") {
         for (name, call) in FUNCTIONS {
-            let [forward, backward] = time(&[128, 1024], [0.02, 0.98], call);
+            let [forward, backward] = time(&[128, 1024], [0.02, 0.98], call, true);
             println!(r#"{{"function": "{name}", "forward": {forward:.4}, "backward": {backward:.4}}}"#);
         }
         return Ok(());
@@ -119,7 +123,7 @@ fn main() -> Result<(), rayon::ThreadPoolBuildError> {
     ];
     for (name, call) in calls {
         for shape in [[128, 10], [1024, 1000]] {
-            let [forward, backward] = time(&shape, [-2.0, 2.0], call);
+            let [forward, backward] = time(&shape, [-2.0, 2.0], call, false);
             println!("{name:<24} {:>16} {forward:>9.3} {backward:>9.3}", format!("{shape:?}"));
         }
     }

@@ -84,7 +84,7 @@ def single_operations(args):
 
 
 def chain(library):
-    """Ten elementwise operations."""
+    """Nine elementwise operations."""
     return lambda x: library.tanh(x * 1.5 + 0.5) * x + library.exp(x * x * -0.5) - x
 
 

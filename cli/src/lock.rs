@@ -13,7 +13,7 @@ use super::output::{complain, remove};
 pub const UNFINISHED: &str = "unfinished.lock";
 
 /// How often, and after which pause, a lock that is taken is tried again.
-const ASKED: usize = 5;
+const TRIES: usize = 5;
 const PAUSE: Duration = Duration::from_millis(20);
 
 /// Exclusive access to a folder, until this is dropped or the program ends.
@@ -61,23 +61,27 @@ impl Lock {
         try_lock: impl Fn(&File) -> std::result::Result<(), TryLockError>,
     ) -> Result<Self> {
         let bad = |e: std::io::Error| Error::file(path, format!("cannot be locked: {e}"));
-        let file = File::options().create(true).truncate(false).write(true).open(path).map_err(bad)?;
-        let mut locked = try_lock(&file);
-        for _ in 0..ASKED {
-            // Another program may be asking, which takes an instant.
-            if matches!(locked, Err(TryLockError::WouldBlock)) {
-                std::thread::sleep(PAUSE);
-                locked = try_lock(&file);
+        let open = || File::options().create(true).truncate(false).write(true).open(path).map_err(bad);
+        let (mut file, mut tries) = (open()?, 0);
+        loop {
+            match try_lock(&file) {
+                // Its last owner has removed it after this program opened it.
+                Ok(()) if !path.exists() => {}
+                Ok(()) => break,
+                // Another program may be asking, which takes an instant.
+                Err(TryLockError::WouldBlock) => {}
+                Err(TryLockError::Error(e)) => {
+                    let what = "make sure that no other raygrad writes to this folder";
+                    let path = path.display();
+                    complain(&format!("warning: {path}: this file system has no locks ({e}): {what}"));
+                    break;
+                }
             }
-        }
-        match locked {
-            Ok(()) if !path.exists() => return Err(busy()),
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => return Err(busy()),
-            Err(TryLockError::Error(e)) => complain(&format!(
-                "warning: {}: this file system has no locks ({e}): make sure that no other raygrad writes to this folder",
-                path.display()
-            )),
+            if tries == TRIES {
+                return Err(busy());
+            }
+            std::thread::sleep(PAUSE);
+            (file, tries) = (open()?, tries + 1);
         }
         let owner = format!("{} {:016x}\n", std::process::id(), rand::random::<u64>());
         write_atomic(owner_of(path), owner.as_bytes())?;

@@ -30,18 +30,31 @@ pub fn run(args: &Args) -> Work<()> {
     let mut places = vec![out.clone(), render::frames_of(out)];
     places.extend(convert::staging(out));
     places.extend(entries(out).unwrap_or_default());
-    let at = places.into_iter().find(|place| place.join(shard::FOLDER).is_dir()).unwrap_or_else(|| out.clone());
-    // The result is beside it, and `.` has no name.
-    let at = if at.file_name().is_none() { at.canonicalize().unwrap_or(at) } else { at };
-    let what = match shard::progress(&at)? {
-        Progress::Complete(complete) => return merge(*complete),
-        Progress::None => "holds no shards: name the --out of `render` or `prepare`, or the run of `eval`".into(),
-        Progress::Merging => "another raygrad merges the shards: wait until it ends".into(),
-        Progress::Incomplete(missing) => {
-            format!("misses shards {missing}: wait for those that run, repeat the others with --shard")
-        }
-    };
-    Err(Error::file(out, what).into())
+    places.retain(|place| place.join(shard::FOLDER).is_dir());
+    // A run may have several results.
+    let (mut has_merged, mut left) = (false, None);
+    for at in places {
+        // The result is beside it, and `.` has no name.
+        let at = if at.file_name().is_none() { at.canonicalize().unwrap_or(at) } else { at };
+        let what = match shard::progress(&at)? {
+            Progress::Complete(complete) => {
+                merge(*complete)?;
+                has_merged = true;
+                continue;
+            }
+            Progress::None => continue,
+            Progress::Merging => "another raygrad merges the shards: wait until it ends".into(),
+            Progress::Incomplete(missing) => {
+                format!("misses shards {missing}: wait for those that run, repeat the others with --shard")
+            }
+        };
+        left.get_or_insert_with(|| Error::file(if at.starts_with(out) { &at } else { out }, what));
+    }
+    let none = || Error::file(out, "holds no shards: name the --out of `render` or `prepare`, or the run of `eval`");
+    match left.or_else(|| (!has_merged).then(none)) {
+        Some(error) => Err(error.into()),
+        None => Ok(()),
+    }
 }
 
 /// Merges the shards in a folder of results if all are complete. Called after `shard` is. Of several ranks, rank 0
@@ -66,14 +79,21 @@ pub fn merge_if_complete(at: &Path, shard: Shard) -> Work<()> {
 fn merge_ranks(at: &Path) -> Work<()> {
     /// Looks, half a second apart. Clients of NFS may not look at a folder again for a minute.
     const LOOKS: usize = 150;
-    let mut rest = String::new();
+    let (mut rest, mut is_merging) = (String::new(), false);
     for _ in 0..LOOKS {
         rest = match shard::progress(at)? {
             Progress::Complete(complete) => return merge(*complete),
-            Progress::Merging => "; another raygrad merges them".into(),
+            Progress::None if is_merging => return Ok(()),
             Progress::None => "; there are none".into(),
+            Progress::Merging => {
+                is_merging = true;
+                "; another raygrad merges them".into()
+            }
             Progress::Incomplete(missing) => format!("; still missing {missing}"),
         };
+        if interrupt::requested() {
+            break;
+        }
         std::thread::sleep(Duration::from_millis(500));
     }
     let what = format!(

@@ -139,8 +139,7 @@ pub fn bytes_of_first(exchange: &mut dyn Exchange, bytes: &[u8]) -> Result<Vec<u
 
 /// [`bytes_of_first`] in messages of this many bytes.
 fn in_messages(exchange: &mut dyn Exchange, bytes: &[u8], message: usize) -> Result<Vec<u8>, Error> {
-    let own = |bytes| if exchange.rank() == 0 { bytes } else { &[][..] };
-    let bytes = own(bytes);
+    let bytes = if exchange.rank() == 0 { bytes } else { &[] };
     let mut first = |bytes: &[u8]| Ok::<_, Error>(exchange.all_gather(bytes).map_err(failed)?.swap_remove(0));
     let mut received = first(&bytes.len().to_le_bytes())?;
     let length = received[..].try_into().map(usize::from_le_bytes);

@@ -72,14 +72,8 @@ impl CaptureArgs {
 
     /// These flags as they were given, each after a blank.
     pub fn flags(&self) -> String {
-        let format = self.format.map(|format| match format {
-            Format::Blender => "blender",
-            Format::Transforms => "transforms",
-            Format::Colmap => "colmap",
-            Format::Llff => "llff",
-        });
         let test = self.test.as_ref().map(|test| format!(" --test {}", quoted(Path::new(&test.to_string()))));
-        let format = format.map(|format| format!(" --format {format}"));
+        let format = self.format.map(|format| format!(" --format {}", format.word()));
         let scene_type = self.scene_type.map(|scene_type| format!(" --scene-type {scene_type}"));
         let masks = self.mask_as_alpha.then(|| " --mask-as-alpha".to_owned());
         [test, format, scene_type, masks].into_iter().flatten().collect()
@@ -124,8 +118,10 @@ impl Scene {
     /// Reads the scene's files and analyses the scene.
     pub fn open(&self, args: &CaptureArgs) -> Result<Opened> {
         let CaptureArgs { test, format, scene_type, mask_as_alpha } = args;
-        let description = format.map_or(Ok(None), |format| self.description(format))?;
-        if !matches!(self, Scene::Folder(_)) {
+        let Scene::Folder(folder) = self else {
+            if format.is_some() {
+                return Err(Error::setting("format", "built-in scenes have no files: leave the flag out"));
+            }
             if *mask_as_alpha {
                 return Err(Error::setting("mask-as-alpha", "built-in scenes have no masks: leave the flag out"));
             }
@@ -133,8 +129,9 @@ impl Scene {
                 return Err(Error::setting("test", "built-in scenes have their own test images: leave the flag out"));
             }
             return Ok(Opened::new(self, None, *scene_type));
-        }
-        let capture = self.capture(test.as_ref(), description.as_deref())?;
+        };
+        let capture = args.read(folder)?;
+        assumptions(&capture);
         let analysis = args.analyze(&capture)?;
         Ok(Opened { mask_as_alpha: *mask_as_alpha, ..Opened::new(self, Some((capture, analysis)), *scene_type) })
     }
@@ -157,17 +154,6 @@ impl Scene {
         assumptions(&capture);
         hold_out.map_or(Ok(()), |chosen| capture.hold_out(chosen))?;
         Ok(capture)
-    }
-
-    /// The file that describes the capture in this format, below the scene's folder.
-    ///
-    /// # Errors
-    /// For a built-in scene, or if the folder has no description in the format.
-    pub fn description(&self, format: Format) -> Result<Option<PathBuf>> {
-        match self {
-            Scene::Folder(folder) => Ok(inside(&Capture::read_unsplit(folder, None, Some(format))?)),
-            _ => Err(Error::setting("format", "built-in scenes have no files: leave the flag out")),
-        }
     }
 
     /// Like [`open`](Self::open), with the scene transform of a model. `unbounded` is true for an unbounded scene.
@@ -222,7 +208,7 @@ impl Opened {
 
     /// The file that describes the capture, below its folder.
     pub fn description(&self) -> Option<PathBuf> {
-        inside(&self.capture.as_ref()?.0)
+        inside(&self.scene, &self.capture.as_ref()?.0)
     }
 
     /// The factor that brings images to a size that suits a grid with at most `cells` cells along a scene of this type; 1
@@ -297,9 +283,13 @@ pub fn assumptions(capture: &Capture) {
     capture.assumptions.iter().for_each(|what| complain(&format!("note: {what}")));
 }
 
-/// The file of a capture below its folder.
-fn inside(capture: &Capture) -> Option<PathBuf> {
-    Some(capture.file.strip_prefix(&capture.folder).ok()?.to_owned())
+/// The file of a capture below the folder of its scene; `None` if the capture is in another folder, where reading the
+/// scene finds it again.
+fn inside(scene: &Scene, capture: &Capture) -> Option<PathBuf> {
+    let Scene::Folder(folder) = scene else { return None };
+    let [own, found] = [folder, &capture.folder].map(|folder| folder.canonicalize().ok());
+    let is_own = own.is_some() && own == found;
+    Some(capture.file.strip_prefix(&capture.folder).ok().filter(|_| is_own)?.to_owned())
 }
 
 /// Says why images are left out, of which at most three are named. There are `others` besides.
@@ -358,6 +348,23 @@ mod tests {
             };
             assert_eq!([names(Split::Train), names(Split::Test)], [["1.png", "3.png"], ["0.png", "2.png"]]);
         }
+    }
+
+    /// What is below another folder would be looked for in the scene's, where another file may have its path.
+    #[test]
+    fn description_is_below_the_folder_of_the_scene() {
+        let folder = tempfile::tempdir().unwrap();
+        let inner = folder.path().join("dense/0");
+        std::fs::create_dir_all(&inner).unwrap();
+        let scene = Scene::Folder(folder.path().to_owned());
+        let of = |folder: &Path| {
+            let capture = Capture::new(folder, folder.join("sparse/0/images.bin"), Format::Colmap, vec![]);
+            inside(&scene, &capture)
+        };
+        assert_eq!(of(folder.path()), Some("sparse/0/images.bin".into()));
+        assert_eq!(of(&folder.path().join("dense/..")), Some("sparse/0/images.bin".into()));
+        assert_eq!(of(&inner), None);
+        assert_eq!(inside(&Scene::Embedded, &Capture::new(&inner, inner.join("a"), Format::Colmap, vec![])), None);
     }
 
     #[test]

@@ -8,8 +8,8 @@ use raygrad::nerf::{Budget, Result, StepStats};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::machine;
 use super::run::{Run, write_json};
+use super::{machine, ranks};
 
 /// File name in a run's folder.
 const FILE: &str = "summary.json";
@@ -86,6 +86,9 @@ struct Summary<'a> {
     pose_motion: Option<PoseMotion>,
     /// Number of gradient elements that were not finite.
     non_finite_gradients: u64,
+    /// Number of processes that trained together.
+    ranks: usize,
+    /// Number of threads of this one.
     threads: usize,
     processor: String,
 }
@@ -187,6 +190,7 @@ impl Account {
             restarts: stats.restarts,
             pose_motion: stats.pose_motion,
             non_finite_gradients: stats.non_finite,
+            ranks: ranks::own().map_or(1, |(_, ranks)| ranks),
             threads: rayon::current_num_threads(),
             processor: machine::processor(),
         };

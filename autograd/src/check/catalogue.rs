@@ -250,6 +250,7 @@ fn reductions() -> Vec<Entry> {
         layer_norm_grad(1),
         Entry::new(softmax::SOFTMAX_GRAD).sample(&[&[2, 5], &[2, 5], &[2, 5]]).sample(&[&[0, 3], &[0, 3], &[0, 3]]),
         Entry::new(GradientOp { op: softmax::LogSoftmax, input: 0 }).sample(&[&[2, 5], &[2, 5]]).sample(&[&[3], &[3]]),
+        Entry::new(GradientOp { op: softmax::LogSumExp, input: 0 }).sample(&[&[2, 5], &[2]]).sample(&[&[3], &[]]),
         Entry::new(GradientOp { op: product::Product, input: 0 })
             .sample(&[&[2, 4], &[2]])
             .sample_of(vec![zeros(&[3, 4], 5).remove(0), spread(&[3], &[0.3..1.0], 1)])
@@ -264,6 +265,9 @@ fn losses() -> Vec<Entry> {
         Entry::new(loss::MeanLoss(loss::SquaredError)).sample(&[&[2, 3], &[2, 3], &[2, 3]]).sample(&[&[], &[], &[]]),
         Entry::new(loss::MeanCrossEntropy { classes: [2, 0, 2].into() }).sample(&[&[3], &[3, 4]]),
         cross_entropy(&[2, 0, 2]).sample(&[&[3, 4]]).sample(&[&[3, 40]]).sample(&[&[1, 3, 3]]),
+        Entry::new(GradientOp { op: loss::CrossEntropy { classes: [2, 0, 2].into() }, input: 0 })
+            .sample(&[&[3, 4], &[3]])
+            .sample(&[&[1, 3, 3], &[1, 3]]),
         cross_entropy(&[1]).sample(&[&[2]]),
         cross_entropy(&[]).sample(&[&[0, 3]]),
     ]
@@ -289,11 +293,11 @@ fn core() -> Vec<Entry> {
         Entry::new(sum(&[3, 1], false)).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
         Entry::new(sum(&[], true)).linear().sample(&[&[2, 3]]).sample(&[&[]]),
         Entry::new(sum(&[3, 1], true)).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
-        Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]), mean: false })
+        Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]), divided: false })
             .linear()
             .sample(&[&[3, 1]])
             .sample(&[&[]]),
-        Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]), mean: true })
+        Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]), divided: true })
             .linear()
             .sample(&[&[3, 1]])
             .sample(&[&[]]),

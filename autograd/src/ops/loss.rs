@@ -1,7 +1,8 @@
 //! Losses between predictions and targets.
 
 use super::arithmetic::Alias;
-use super::softmax::softmax_times;
+use super::gradient_op::{FusedGradient, GradientOp};
+use super::softmax::{column, softmax_times};
 use crate::cases::INF;
 use crate::error::ensure;
 use crate::formula::Elementwise;
@@ -199,21 +200,12 @@ impl<T: Scalar> Op<T> for CrossEntropy {
         out
     }
 
+    fn reads(&self) -> Reads {
+        Reads::INPUTS
+    }
+
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let x = cx.x(0);
-        let n = x.shape()[x.shape().len() - 1];
-        if cx.recording() {
-            // The gradient at the class is minus the sum of the others: the probability minus 1 would cancel.
-            let is_class = (0..x.value().len()).map(|i| self.classes[i / n] as usize == i % n);
-            let is_class = Mask::new(x.shape(), is_class.collect::<Vec<_>>());
-            let mut column = Shape::from_slice(cx.g().shape());
-            column.push(1);
-            let others = x.constant(0.0).where_(&is_class, softmax_times(&x, &cx.g().reshape(&column)));
-            return Grads::one((-others.sum_over(Axes::from(-1).keepdims())).where_(&is_class, others));
-        }
-        let (g, mut out) = (cx.g().value().as_slice(), cx.pool().tensor(x.shape()));
-        cross_entropy_rows_grad(x.value().as_slice(), n, &self.classes, g, out.as_mut_slice(), cx.pool());
-        Grads::one(cx.constant(out))
+        Grads::one(cx.tape().apply(GradientOp { op: self.clone(), input: 0 }, &[&cx.x(0), cx.g()]))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
@@ -222,6 +214,26 @@ impl<T: Scalar> Op<T> for CrossEntropy {
         column[axes] = 1;
         let logs = x[0].log_softmax(-1).gather(-1, Indices::new(&column, self.classes.clone()));
         Some(-logs.reshape(&x[0].shape()[..axes]))
+    }
+}
+
+impl<T: Scalar> FusedGradient<T> for CrossEntropy {
+    const GRADIENT: &'static str = "cross_entropy_grad";
+
+    fn gradient(&self, _input: usize, x: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        let (n, mut out) = (x[0].shape()[x[0].ndim() - 1], pool.tensor(x[0].shape()));
+        cross_entropy_rows_grad(x[0].as_slice(), n, &self.classes, g.as_slice(), out.as_mut_slice(), pool);
+        out
+    }
+
+    fn recorded<'t>(&self, _input: usize, x: &[Var<'t, T>], g: &Var<'t, T>) -> Option<Var<'t, T>> {
+        let x = &x[0];
+        let n = x.shape()[x.shape().len() - 1];
+        // The gradient at the class is minus the sum of the others: the probability minus 1 would cancel.
+        let is_class = (0..x.value().len()).map(|i| self.classes[i / n] as usize == i % n);
+        let is_class = Mask::new(x.shape(), is_class.collect::<Vec<_>>());
+        let others = x.constant(0.0).where_(&is_class, softmax_times(x, &column(g)));
+        Some((-others.sum_over(Axes::from(-1).keepdims())).where_(&is_class, others))
     }
 }
 

@@ -49,12 +49,12 @@ pub struct BroadcastTo {
     /// The shape of the output.
     pub shape: Shape,
     /// Divides by the number of copies.
-    pub mean: bool,
+    pub divided: bool,
 }
 
 impl<T: Scalar> Op<T> for BroadcastTo {
     fn name(&self) -> &'static str {
-        if self.mean { "spread_to" } else { "broadcast_to" }
+        if self.divided { "spread_to" } else { "broadcast_to" }
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
@@ -65,7 +65,7 @@ impl<T: Scalar> Op<T> for BroadcastTo {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        if !self.mean {
+        if !self.divided {
             return x[0].broadcast_to(&self.shape);
         }
         let [from, to] = [&self.shape, x[0].shape()].map(|shape| shape.iter().product::<usize>() as f64);
@@ -79,7 +79,7 @@ impl<T: Scalar> Op<T> for BroadcastTo {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let g = cx.g();
-        Grads::one(if self.mean { g.mean_to(cx.shape(0)) } else { g.sum_to(cx.shape(0)) })
+        Grads::one(if self.divided { g.mean_to(cx.shape(0)) } else { g.sum_to(cx.shape(0)) })
     }
 }
 
@@ -162,11 +162,11 @@ impl<'t, T: Scalar> Var<'t, T> {
         if self.shape() == shape {
             return self.clone();
         }
-        self.tape().apply(BroadcastTo { shape: shape.into(), mean: false }, &[self])
+        self.tape().apply(BroadcastTo { shape: shape.into(), divided: false }, &[self])
     }
 
     /// Broadcasts shares: this tensor divided by the number of its copies. The adjoint of the mean.
     pub(crate) fn spread_to(&self, shape: &[usize]) -> Self {
-        self.tape().apply(BroadcastTo { shape: shape.into(), mean: true }, &[self])
+        self.tape().apply(BroadcastTo { shape: shape.into(), divided: true }, &[self])
     }
 }

@@ -19,6 +19,13 @@ fn kept_last() -> Axes {
     Axes::from(-1).keepdims()
 }
 
+/// A tensor with a number for each row as a column.
+pub(super) fn column<'t, T: Scalar>(x: &Var<'t, T>) -> Var<'t, T> {
+    let mut shape = Shape::from_slice(x.shape());
+    shape.push(1);
+    x.reshape(&shape)
+}
+
 /// `g` times the softmax of `x` along the last axis, recorded. Each power is the square of its root, around `g`, which may
 /// bring it back into range.
 pub(super) fn softmax_times<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
@@ -165,27 +172,35 @@ impl<T: Scalar> Op<T> for LogSumExp {
     }
 
     fn reads(&self) -> Reads {
-        Reads::ALL
+        Reads::INPUTS
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (x, g) = (cx.x(0), cx.g());
-        if cx.recording() {
-            let mut column = Shape::from_slice(g.shape());
-            column.push(1);
-            let is_lost = cx.y().value().map(|y| if y == T::from_f64(f64::NEG_INFINITY) { T::ONE } else { T::ZERO });
-            let is_lost = is_lost.reshape(&column).broadcast_to(x.shape()).gt(T::ZERO);
-            // The powers of a row of -inf are NaN, and so would their gradients be that are not chosen.
-            let kept = x.constant(0.0).where_(&is_lost, &x);
-            let multiples = softmax_times(&kept, &g.reshape(&column));
-            return Grads::one(x.constant(0.0).where_(&is_lost, multiples));
-        }
-        let kernel = |x: &[T], n, out: &mut [T]| rows::logsumexp_rows_grad(x, n, g.value().as_slice(), out, cx.pool());
-        Grads::one(cx.constant(by_rows(x.value(), cx.pool(), kernel)))
+        Grads::one(cx.tape().apply(GradientOp { op: *self, input: 0 }, &[&cx.x(0), cx.g()]))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         Some(x[0].exp().sum_over(-1).ln())
+    }
+}
+
+impl<T: Scalar> FusedGradient<T> for LogSumExp {
+    const GRADIENT: &'static str = "logsumexp_grad";
+
+    fn gradient(&self, _input: usize, x: &[&Tensor<T>], g: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        by_rows(x[0], pool, |x, n, out| rows::logsumexp_rows_grad(x, n, g.as_slice(), out, pool))
+    }
+
+    fn recorded<'t>(&self, _input: usize, x: &[Var<'t, T>], g: &Var<'t, T>) -> Option<Var<'t, T>> {
+        let x = &x[0];
+        if x.value().is_empty() {
+            return Some(x * column(g));
+        }
+        let lowest = T::from_f64(f64::NEG_INFINITY);
+        let is_lost = x.value().max_over(kept_last()).broadcast_to(x.shape()).elementwise_eq(lowest);
+        // The powers of a row of -inf are NaN, and so would their gradients be that are not chosen.
+        let kept = x.constant(0.0).where_(&is_lost, x);
+        Some(x.constant(0.0).where_(&is_lost, softmax_times(&kept, &column(g))))
     }
 }
 

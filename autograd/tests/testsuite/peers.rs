@@ -27,7 +27,7 @@ macro_rules! cases {
 }
 
 /// Operations of the catalogue without a reference, and why.
-const WITHOUT: [(&str, &str); 19] = [
+const WITHOUT: [(&str, &str); 21] = [
     ("alias", "the tape's own copy of an input, not callable from outside; it is the identity"),
     ("mul_add", "the exact sum of a product in recorded gradients, not callable from outside; tests of those cover it"),
     ("ratio", "part of the gradients of norm, var and std, not callable from outside; tests of their range cover it"),
@@ -37,6 +37,8 @@ const WITHOUT: [(&str, &str); 19] = [
     ("cumprod_grad", "compared as the gradient of cumprod"),
     ("layer_norm_grad", "compared as the gradient of layer_norm"),
     ("log_softmax_grad", "compared as the gradient of log_softmax"),
+    ("logsumexp_grad", "compared as the gradient of logsumexp"),
+    ("cross_entropy_grad", "compared as the gradient of cross_entropy"),
     ("normalize_grad", "compared as the gradient of normalize"),
     ("prod_grad", "compared as the gradient of prod"),
     ("recurrence_grad", "compared as the gradient of recurrence"),

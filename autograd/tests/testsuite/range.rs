@@ -690,30 +690,58 @@ fn deviation_of_numbers_whose_squares_overflow() {
     }
 }
 
-/// Many numbers at the end of the range, of which sums and products with their count leave it.
+/// Calls `check` with a number at the end of each type's range.
+macro_rules! at_the_end {
+    ($check:ident) => {{
+        $check::<f32>(3e38);
+        $check::<f64>(1.7e308);
+    }};
+}
+
+fn near<T: Scalar>(got: T, expected: f64) -> bool {
+    got.to_f64() == expected || (got.to_f64() / expected - 1.0).abs() < 8.0 * T::EPSILON
+}
+
+/// The gradient, and the recorded gradient.
+fn both<T: Scalar>(y: &Var<'_, T>, wrt: &[&Var<'_, T>]) -> [Vec<Tensor<T>>; 2] {
+    [y.grad(wrt), y.grad_graph(wrt).into_iter().map(Var::into_value).collect()]
+}
+
+/// The product of a deviation and the number of elements is not in range.
 #[test]
-fn long_rows_at_the_end_of_the_range() {
+fn deviation_of_many_numbers_at_the_end_of_the_range() {
     fn check<T: Scalar>(most: f64) {
-        let (most, tape) = (T::from_f64(most), Tape::<T>::new());
-        let near = |got: T, expected: f64| (got.to_f64() / expected - 1.0).abs() < 8.0 * T::EPSILON;
-        let n = 1024;
+        let (most, tape, n) = (T::from_f64(most), Tape::<T>::new(), 1024);
         let x = tape.leaf(Tensor::from_fn(&[n], |i| if i % 2 == 0 { most } else { -most }));
-        let y = x.std(0);
         let share = 1.0 / n as f64;
         let third = Tensor::from_fn(&[n], |i| if i == 3 { T::ONE } else { T::ZERO });
         assert!(near(along(&|x| x[0].std(0), x.value(), &third), -share));
-        for grad in [y.grad(&[&x]).remove(0), y.grad_graph(&[&x]).remove(0).into_value()] {
+        for grads in both(&x.std(0), &[&x]) {
             let mut signs = [share, -share].into_iter().cycle();
-            assert!(grad.iter().all(|got| near(got, signs.next().unwrap())), "{:?}", grad.as_slice()[0]);
+            assert!(grads[0].iter().all(|got| near(got, signs.next().unwrap())), "{:?}", grads[0].as_slice()[0]);
         }
-        // A mean in the direction of numbers whose sum is not in range, and that of losses.
-        let direction = Tensor::full(&[4], most);
-        let ones = Tensor::full(&[4], T::ONE);
-        assert!(near(along(&|x| x[0].mean(), &ones, &direction), most.to_f64()));
+    }
+    at_the_end!(check);
+}
+
+/// The sum of a direction is not in range, its mean is.
+#[test]
+fn means_along_numbers_at_the_end_of_the_range() {
+    fn check<T: Scalar>(most: f64) {
+        let (ones, direction) = (Tensor::full(&[4], T::ONE), Tensor::full(&[4], T::from_f64(most)));
+        assert!(near(along(&|x| x[0].mean(), &ones, &direction), T::from_f64(most).to_f64()));
         let half = Tensor::full(&[4], T::from_f64(0.5));
         let l1 = along(&|x| x[0].l1_loss(x[0].tape().constant(half.clone())), &ones, &direction);
-        assert!(near(l1, most.to_f64()));
-        // Gradients of gain and bias whose sums come back into range.
+        assert!(near(l1, T::from_f64(most).to_f64()));
+    }
+    at_the_end!(check);
+}
+
+/// Sums of shares of gain and bias leave the range and come back.
+#[test]
+fn gain_and_bias_of_gradients_at_the_end_of_the_range() {
+    fn check<T: Scalar>(most: f64) {
+        let (most, tape) = (T::from_f64(most), Tape::<T>::new());
         let x = tape.constant(Tensor::from_fn(&[4, 2], |i| T::from_f64((i % 2) as f64)));
         let (gain, bias) = (tape.leaf(Tensor::full(&[2], T::ONE)), tape.leaf(Tensor::zeros(&[2])));
         for (weights, of_bias) in [([1.0, 1.0, -1.0, -1.0], 0.0), ([1.0, 1.0, -1.0, -0.5], 0.5)] {
@@ -721,29 +749,60 @@ fn long_rows_at_the_end_of_the_range() {
             let weights =
                 tape.constant(Tensor::from_fn(&[4, 2], |i| if i % 2 == 0 { weights[i / 2] } else { T::ZERO }));
             let loss = (x.layer_norm(&gain, &bias, 0.0) * &weights).sum();
-            let recorded = loss.grad_graph(&[&gain, &bias]).into_iter().map(Var::into_value).collect::<Vec<_>>();
-            for grads in [loss.grad(&[&gain, &bias]), recorded] {
+            for grads in both(&loss, &[&gain, &bias]) {
                 let expected = 0.9 * of_bias * most.to_f64();
                 let [gain, bias] = [&grads[0], &grads[1]].map(|grad| grad.as_slice());
                 for (got, expected) in [(gain[0], -expected), (gain[1], 0.0), (bias[0], expected), (bias[1], 0.0)] {
-                    assert!(got.to_f64() == expected || near(got, expected), "{got:?} for {expected}");
+                    assert!(near(got, expected), "{got:?} for {expected}");
                 }
             }
         }
-        // A length that overflows still has a direction.
-        let x = tape.leaf(Tensor::from([most, most]));
+    }
+    at_the_end!(check);
+}
+
+/// A length that overflows still has a direction.
+#[test]
+fn direction_of_a_length_beyond_the_range() {
+    fn check<T: Scalar>(most: f64) {
+        let tape = Tape::<T>::new();
+        let x = tape.leaf(Tensor::full(&[2], T::from_f64(most)));
         assert!(x.norm().item().to_f64().is_infinite());
-        for grad in [x.norm().grad(&[&x]).remove(0), x.norm().grad_graph(&[&x]).remove(0).into_value()] {
-            assert!(grad.iter().all(|got| near(got, 0.5_f64.sqrt())), "{grad:?}");
+        for grads in both(&x.norm(), &[&x]) {
+            assert!(grads[0].iter().all(|got| near(got, 0.5_f64.sqrt())), "{grads:?}");
         }
     }
-    check::<f32>(3e38);
-    check::<f64>(1.7e308);
+    at_the_end!(check);
 }
 
 /// The derivative of a function of one operand in a direction.
 fn along<T: Scalar>(f: &dyn for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &Tensor<T>, direction: &Tensor<T>) -> T {
     jvp(f, std::slice::from_ref(x), std::slice::from_ref(direction)).1.item()
+}
+
+/// Products of both incoming gradients leave the range of f32, their products with the probabilities do not.
+#[test]
+fn second_derivatives_of_logarithms_of_sums() {
+    fn second(logits: [f32; 2], g: f32, h: f32, f: impl for<'t> Fn(&Var<'t, f32>) -> Var<'t, f32>) -> f64 {
+        let tape = Tape::<f32>::new();
+        let x = tape.leaf(Tensor::from(logits));
+        let first = (f(&x) * g).grad_graph(&[&x]).remove(0);
+        f64::from((first.slice_axis(0, ..1) * h).sum().grad(&[&x])[0].as_slice()[0])
+    }
+    for (logits, g, h) in [([0.0, -2.0], 2e38, 1.0), ([0.0, -20.0], 2e38, 1.0), ([0.0, -10.0], 1e19, 1e20)] {
+        // g h y (1 - y), for the probability y of the first.
+        let odds = f64::from(logits[1]).exp();
+        let expected = f64::from(g) * f64::from(h) * odds / ((1.0 + odds) * (1.0 + odds));
+        for (name, got) in [
+            ("logsumexp", second(logits, g, h, |x| x.logsumexp())),
+            ("cross_entropy", second(logits, g, h, |x| x.reshape(&[1, 2]).cross_entropy([1]).sum())),
+        ] {
+            assert!((got / expected - 1.0).abs() < 1e-6, "{name} of {logits:?}: {got:e} for {expected:e}");
+        }
+    }
+    let (zeros, all) = (Tensor::zeros(&[4]), Tensor::full(&[4], 1e38_f32));
+    let slope = along(&|x| x[0].logsumexp(), &zeros, &all);
+    assert!((slope / 1e38 - 1.0).abs() < 1e-6, "{slope:e}");
 }
 
 /// NaN in one row changes nothing in others, which have digits only if a large gradient lifts them.

@@ -323,6 +323,8 @@ fn second_derivatives_of_rows_of_all_bits_are_finite() {
         }
         let term = largest([size, first(g_size * Exact::new(n as f64))]);
         check_finite("log_softmax", [&logits, &g, &h], term, |x| x.log_softmax(-1));
+        check_finite("logsumexp", [&logits, &g[..1], &h], term, |x| x.logsumexp());
+        check_finite("cross_entropy", [&logits, &g[..1], &h], term, |x| x.cross_entropy([0]));
         // The product of all elements but one or two is at most that of all that are larger than 1.
         let product = x.iter().fold(Exact::new(1.0), |product, &x| product * largest([x, Exact::new(1.0)]));
         let term = largest([size * product, first(g_size * product)]);

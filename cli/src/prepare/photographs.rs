@@ -15,9 +15,11 @@ use crate::output::complain;
 use crate::progress::Progress;
 
 /// File extensions of images that raygrad reads.
-const READ: [&str; 9] = ["png", "jpg", "jpeg", "webp", "jfif", "jpe", "tif", "tiff", "bmp"];
+const READ: [&str; 6] = ["png", "jpg", "jpeg", "webp", "jfif", "jpe"];
 /// File extensions of images that other programs convert; the content decides.
-const CONVERTED: [&str; 5] = ["heic", "heif", "hif", "avif", "exr"];
+const CONVERTED: [&str; 4] = ["heic", "heif", "hif", "avif"];
+/// File extensions of images that count in folders without others: beside those they are often depths, or copies.
+const ALONE: [&str; 4] = ["tif", "tiff", "bmp", "exr"];
 /// File extensions of images that raygrad does not read.
 const NOT_READ: [&str; 9] = ["dng", "cr2", "cr3", "nef", "arw", "orf", "raf", "rw2", "gif"];
 
@@ -74,7 +76,7 @@ pub fn ends(path: &Path, endings: &[&str]) -> bool {
 
 /// Refuses a single image as the input.
 pub fn check_no_image(file: &Path) -> Result<()> {
-    match [&READ[..], &CONVERTED, &NOT_READ].iter().any(|endings| ends(file, endings)) {
+    match is_image(file) {
         true => Err(Error::file(file, "is a single image: name the folder that holds the images")),
         false => Ok(()),
     }
@@ -91,22 +93,39 @@ fn places(folder: &Path) -> impl Iterator<Item = PathBuf> {
 /// Returns true if [`find`] finds images in a folder, or some that raygrad cannot read.
 pub fn are_in(folder: &Path) -> bool {
     let files = places(folder).filter_map(|place| std::fs::read_dir(place).ok()).flatten().flatten();
-    files
-        .map(|entry| entry.path())
-        .any(|path| [&READ[..], &CONVERTED, &NOT_READ].iter().any(|endings| ends(&path, endings)))
+    files.map(|entry| entry.path()).any(|path| is_image(&path))
 }
 
-/// The images in a folder, sorted by name, and the number of those that raygrad cannot read.
-fn images(folder: &Path) -> (Vec<PathBuf>, usize) {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    // Hidden files, such as the `._` twins of macOS, are no images.
-    let shown = entries.filter(|entry| !entry.file_name().as_encoded_bytes().starts_with(b"."));
-    let files: Vec<PathBuf> = shown.map(|entry| entry.path()).filter(|path| path.is_file()).collect();
-    let unread = files.iter().filter(|path| ends(path, &NOT_READ)).count();
-    let mut found: Vec<PathBuf> =
-        files.into_iter().filter(|path| ends(path, &READ) || ends(path, &CONVERTED)).collect();
-    found.sort();
-    (found, unread)
+/// Returns true if the file name has the extension of an image, also of one that raygrad cannot read.
+fn is_image(path: &Path) -> bool {
+    [&READ[..], &CONVERTED, &ALONE, &NOT_READ].iter().any(|endings| ends(path, endings))
+}
+
+/// The images in a folder.
+struct Images {
+    /// Sorted by name.
+    found: Vec<PathBuf>,
+    /// The number of those that are [no images beside others](ALONE).
+    aside: usize,
+    /// The number of those that raygrad cannot read.
+    unread: usize,
+}
+
+impl Images {
+    fn of(folder: &Path) -> Self {
+        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+        // Hidden files, such as the `._` twins of macOS, are no images.
+        let shown = entries.filter(|entry| !entry.file_name().as_encoded_bytes().starts_with(b"."));
+        let mut files: Vec<PathBuf> = shown.map(|entry| entry.path()).filter(|path| path.is_file()).collect();
+        files.sort();
+        let unread = files.iter().filter(|path| ends(path, &NOT_READ)).count();
+        let alone: Vec<PathBuf> = files.iter().filter(|path| ends(path, &ALONE)).cloned().collect();
+        files.retain(|path| ends(path, &READ) || ends(path, &CONVERTED));
+        match files.is_empty() {
+            true => Images { found: alone, aside: 0, unread },
+            false => Images { found: files, aside: alone.len(), unread },
+        }
+    }
 }
 
 /// The images of a folder or of a folder of images in it: the first of those that have most. Warns of images that raygrad
@@ -115,11 +134,11 @@ pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
     let unreadable = |count: usize| {
         format!("{count} images are raw or GIF, which raygrad cannot read: convert them to JPEG, PNG or TIFF")
     };
-    let all: Vec<_> = places(folder).map(|place| (images(&place), place)).collect();
-    let best = all.iter().rev().max_by_key(|((found, _), _)| found.len());
-    let Some(((found, unread), place)) = best.filter(|((found, _), _)| !found.is_empty()) else {
-        if let Some(((_, unread), place)) = all.iter().find(|((_, unread), _)| *unread > 0) {
-            return Err(Error::file(place, unreadable(*unread)));
+    let all: Vec<_> = places(folder).map(|place| (Images::of(&place), place)).collect();
+    let best = all.iter().rev().max_by_key(|(images, _)| images.found.len());
+    let Some((Images { found, aside, unread }, place)) = best.filter(|(images, _)| !images.found.is_empty()) else {
+        if let Some((images, place)) = all.iter().find(|(images, _)| images.unread > 0) {
+            return Err(Error::file(place, unreadable(images.unread)));
         }
         let what = "holds no images: put .jpg, .png, .tif, .webp or .heic files in it or in its folder `images`";
         return Err(Error::file(folder, what));
@@ -127,8 +146,14 @@ pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
     if *unread > 0 {
         complain(&format!("warning: {}: {}", place.display(), unreadable(*unread)));
     }
-    for ((others, _), other) in all.iter().filter(|((others, _), other)| !others.is_empty() && other != place) {
-        let (used, left) = (found.len(), others.len());
+    if *aside > 0 {
+        complain(&format!(
+            "note: {}: {aside} TIFF, BMP and EXR files beside other images are not used",
+            place.display()
+        ));
+    }
+    for (others, other) in all.iter().filter(|(others, other)| !others.found.is_empty() && other != place) {
+        let (used, left) = (found.len(), others.found.len());
         complain(&format!(
             "note: used the {used} images of {}, not the {left} of {}",
             place.display(),

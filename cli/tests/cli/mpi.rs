@@ -69,6 +69,7 @@ fn ranks_train_the_model_of_one_process() {
         assert_eq!(printed.matches("trained  12 steps").count(), 1, "{printed}");
         assert_eq!(printed.contains(&format!("ranks    {ranks}, connected by MPI")), ranks > 1, "{printed}");
         assert!(place.bytes(&format!("{out}/model.safetensors")) == place.bytes("one/model.safetensors"), "{ranks}");
+        assert_eq!(place.json(&format!("{out}/summary.json"))["ranks"], ranks);
     }
     // More steps on another number of ranks.
     succeeds(&place, 3, "train --resume ranks-2 --steps 20");

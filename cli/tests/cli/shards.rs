@@ -337,6 +337,12 @@ fn prepare_in_shards_equals_the_whole() {
     std::fs::write(place.path(".made-unfinished-shards/dataset/images/.raygrad-tmp-abc"), b"half").unwrap();
     place.succeeds("merge made");
     assert!(!place.path("made/images/.raygrad-tmp-abc").exists() && place.path("made/images").is_dir());
+    // Neither the dataset of the shards nor the result.
+    std::fs::remove_dir_all(place.path("made")).unwrap();
+    unmerged(&place, convert, ".made-unfinished-shards");
+    std::fs::remove_dir_all(place.path(".made-unfinished-shards/dataset")).unwrap();
+    place.fails("merge made", &["dataset: is missing, as is what it would become"]);
+    std::fs::remove_dir_all(place.path(".made-unfinished-shards")).unwrap();
     let names = place.path("").read_dir().unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
     assert_eq!(names.filter(|name| name.starts_with('.')).count(), 0);
 }
@@ -411,8 +417,12 @@ fn eval_in_shards_equals_the_whole() {
     assert!(result(&place) == whole);
     remove();
     unmerged(&place, "--threads 2 eval run", "run/eval-test");
-    place.succeeds("merge run");
+    // Another result of the run is not complete. The error names it, and this one is merged all the same.
+    place.succeeds("render run --frames 2 --size 8x6 --out run/a --shard 1/2");
+    place.fails("merge run", &["run/a: misses shards 2/2 (not begun)"]);
+    std::fs::remove_dir_all(place.path("run/a")).unwrap();
     assert!(result(&place) == whole);
+    place.fails("merge run", &["run: holds no shards"]);
     remove();
     unmerged(&place, "--threads 2 eval run", "run/eval-test");
     said(&place.command("merge .").current_dir(place.path("run/eval-test")).output().unwrap());

@@ -33,18 +33,29 @@ impl fmt::Display for Format {
     }
 }
 
+impl Format {
+    /// All formats.
+    pub const ALL: [Format; 4] = [Format::Transforms, Format::Blender, Format::Colmap, Format::Llff];
+
+    /// The word that [`from_str`](Self::from_str) reads: `transforms`, `blender`, `colmap` or `llff`.
+    pub fn word(self) -> &'static str {
+        match self {
+            Format::Transforms => "transforms",
+            Format::Blender => "blender",
+            Format::Colmap => "colmap",
+            Format::Llff => "llff",
+        }
+    }
+}
+
 impl FromStr for Format {
     type Err = Error;
 
-    /// Reads `transforms`, `blender`, `colmap` or `llff`.
+    /// Reads a [word](Self::word).
     fn from_str(text: &str) -> Result<Self> {
-        match text {
-            "transforms" => Ok(Format::Transforms),
-            "blender" => Ok(Format::Blender),
-            "colmap" => Ok(Format::Colmap),
-            "llff" => Ok(Format::Llff),
-            _ => Err(Error::setting("format", format!("is `{text}`; use transforms, blender, colmap or llff"))),
-        }
+        let found = Format::ALL.into_iter().find(|format| format.word() == text);
+        let wrong = || Error::setting("format", format!("is `{text}`; use transforms, blender, colmap or llff"));
+        found.ok_or_else(wrong)
     }
 }
 

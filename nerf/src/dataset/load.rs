@@ -33,7 +33,7 @@ const WHITE_BORDER: f64 = 0.98;
 /// The largest downscale factor that is suggested.
 const MOST_DOWNSCALE: u64 = 1 << 14;
 /// The least mask value of a used pixel.
-pub(super) const WHITE: f32 = 0.99;
+pub(crate) const WHITE: f32 = 0.99;
 
 /// Options of [`Capture::load`].
 #[derive(Clone, Copy)]

@@ -150,7 +150,8 @@ impl Photo {
         Ok(decoder(path.as_ref())?.0.color_type().has_alpha())
     }
 
-    /// Reads the EXIF data of an image file, a TIFF structure, if it has any. A TIFF file is one itself.
+    /// Reads the EXIF data of an image file, a TIFF structure, if it has any. A TIFF file is one itself: most of its
+    /// pixels are then 0.
     ///
     /// # Errors
     /// If the file cannot be read or is not an image.
@@ -158,7 +159,7 @@ impl Photo {
         let path = path.as_ref();
         let (start, length) = start_of(path)?;
         if tiff::is_tiff(&start) {
-            return std::fs::read(path).map(Some).map_err(|e| Error::file(path, format!("cannot be read: {e}")));
+            return tiff::without_pixels(path).map(Some).map_err(|e| Error::file(path, format!("cannot be read: {e}")));
         }
         // As for the header, the start of a JPEG suffices.
         if start.starts_with(JPEG)
@@ -572,7 +573,7 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
         return Err(bad(format!("{width}x{height} pixels are more than the limit of 2^28")));
     }
     if matches!(decoder.color_type(), ColorType::Rgb32F | ColorType::Rgba32F) {
-        return Err(bad("its values are floats, whose white is unknown: save it with 8 or 16 bits".into()));
+        return Err(Error::file(path, tiff::FLOATS));
     }
     if decoder.total_bytes() > MOST_BYTES[0].saturating_mul(length).saturating_add(MOST_BYTES[1]) {
         return Err(bad(format!("{width}x{height} pixels cannot come from {length} bytes: copy it again")));

@@ -37,8 +37,9 @@ enum Hypothesis {
     Order(Order),
 }
 
-/// Adds findings about agreement between images; returns the agreement if enough patches match.
-pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Findings) -> Option<f64> {
+/// Adds findings about agreement between images; returns the agreement, if enough patches match, and the number of
+/// images that were compared for it.
+pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Findings) -> (Option<f64>, usize) {
     let poses: Vec<DAffine3> = all.iter().map(|(view, _)| view.camera.pose).collect();
     let placed = |pose: &dyn Fn(usize) -> DAffine3| -> Vec<Placed<'_>> {
         all.iter().enumerate().map(|(i, (_, picture))| Placed { picture, pose: pose(i) }).collect()
@@ -62,11 +63,11 @@ pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Fin
         let best = enough.max_by(|a, b| a.1.skill().total_cmp(&b.1.skill()));
         if let Some((hypothesis, tally)) = best.filter(|(_, tally)| is_better(tally.skill(), own)) {
             another(hypothesis, [own, tally.skill()], findings);
-            return Some(own);
+            return (Some(own), tried.len());
         }
     }
     if read.trials < ENOUGH {
-        return None;
+        return (None, tried.len());
     }
     if own > GOOD {
         // What poses alone suggested is not so.
@@ -74,12 +75,12 @@ pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Fin
     }
     if own < NONE && read.trials >= 2 * ENOUGH {
         findings.add(Kind::NoAgreement, &[]);
-        return Some(own);
+        return (Some(own), tried.len());
     }
     let of = evenly_spaced((0..all.len()).collect(), most);
     let pairs = compare(&as_read, &of);
     findings.about(Kind::WrongPose, wrong_poses(&pairs).into_iter().map(|i| all[i].0), &[]);
-    Some(total(&pairs).skill())
+    (Some(total(&pairs).skill()), of.len())
 }
 
 /// Returns true if images agree so much better under a hypothesis that the poses as read are wrong.

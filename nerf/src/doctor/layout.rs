@@ -107,6 +107,8 @@ fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
 fn by_points(capture: &Capture, views: &[&View]) -> Option<Option<(Convention, Severity)>> {
     /// The fewest points; the most points and cameras that are used.
     const COUNTS: [usize; 3] = [50, 200, 40];
+    /// The share of the points that cameras see at least.
+    const SEEN: f64 = 0.05;
     if capture.points.len() < COUNTS[0] {
         return None;
     }
@@ -119,13 +121,13 @@ fn by_points(capture: &Capture, views: &[&View]) -> Option<Option<(Convention, S
         });
         seen.sum::<usize>() as f64 / (views.len() * points.len()) as f64
     };
-    if share(Convention::AsRead) > 0.05 {
-        return Some(None);
-    }
     // Mirrored captures mirror their points too, so points cannot reveal it.
     let others = [Convention::OpenCv, Convention::WorldToCamera, Convention::WorldToOpenCv].map(|c| (share(c), c));
     let (best, convention) = others.into_iter().max_by(|a, b| a.0.total_cmp(&b.0))?;
-    (best > 0.2).then_some(Some((convention, Error)))
+    match share(Convention::AsRead) {
+        own if own > SEEN && own >= 0.5 * best => Some(None),
+        own => (own <= SEEN && best > 4.0 * SEEN).then_some(Some((convention, Error))),
+    }
 }
 
 /// The convention that the camera axes suggest. It is not proven: cameras inside a room look away from each other too.

@@ -1,7 +1,7 @@
 //! Measurements of the pixels of one image, from a single read at a small size.
 
-use super::picture::{Picture, grey};
-use crate::dataset::load::used_size;
+use super::picture::{Picture, grey, hide};
+use crate::dataset::load::{WHITE, used_size};
 use crate::dataset::photo::sharpness::laplacian_variance;
 use crate::dataset::{Capture, Image, Photo, View};
 use crate::error::Result;
@@ -70,9 +70,13 @@ fn look_at(view: &View) -> Result<Look> {
     [photo.width, photo.height].hash(&mut hasher);
     middle.to_image().data.iter().for_each(|value| value.to_bits().hash(&mut hasher));
     let picture = size.and_then(|_| Picture::new(&view.camera, &small, mask.as_ref()));
-    let [middle, small] = [middle, small].map(|photo| used_alone(&photo, mask.as_ref()));
+    let small = used_alone(&small, mask.as_ref());
     let (luminance, balance) = light(&small);
-    let sharpness = sharpness(&grey(&Photo::from(middle), mean(&small)));
+    let mut bright = grey(&middle, mean(&small));
+    if let Some(mask) = &mask {
+        hide(&mut bright, mask);
+    }
+    let sharpness = sharpness(&bright);
     let hash = hasher.finish();
     Ok(Look { transparent, hollow, unread_profile, hash, sharpness, luminance, balance, used, picture })
 }
@@ -92,7 +96,7 @@ fn used_alone(photo: &Photo, mask: Option<&Photo>) -> Image {
 
 /// Returns true for white pixels of a mask.
 pub(super) fn is_used(pixel: [f32; 4]) -> bool {
-    pixel[0] >= 0.99
+    pixel[0] >= WHITE
 }
 
 /// See [`Look::sharpness`].
@@ -102,7 +106,7 @@ fn sharpness(grey: &Image) -> Option<f64> {
         return None;
     }
     let edges = laplacian_variance([width, height], |y| grey.data[y * width..(y + 1) * width].to_vec());
-    let contrast = variance(grey.data.iter().map(|x| f64::from(*x)));
+    let contrast = variance(grey.data.iter().filter(|x| !x.is_nan()).map(|x| f64::from(*x)));
     (contrast > 1e-6 && edges > 0.0).then(|| (edges / contrast).ln())
 }
 

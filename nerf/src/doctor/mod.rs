@@ -67,8 +67,7 @@ pub fn examine(capture: &Capture, analysis: Result<&SceneAnalysis, &Error>, opti
         looks.iter().filter_map(|(view, look)| Some(Seen { view, look: look.as_ref().ok()? })).collect();
     pixels::examine(&seen, analysis.ok(), &mut findings);
     let pictures = seen.iter().filter_map(|one| Some((one.view, one.look.picture.as_ref()?))).collect::<Vec<_>>();
-    facts.agreement = consistency::examine(&pictures, options.compared, &mut findings);
-    facts.compared = options.compared.min(pictures.len());
+    (facts.agreement, facts.compared) = consistency::examine(&pictures, options.compared, &mut findings);
     Report { facts, findings: findings.sorted(refusal(capture, analysis)) }
 }
 

@@ -143,7 +143,7 @@ pub(super) fn grey(photo: &Photo, behind: [f32; 3]) -> Image {
 }
 
 /// Sets pixels that a mask does not use to unknown.
-fn hide(image: &mut Image, mask: &Photo) {
+pub(super) fn hide(image: &mut Image, mask: &Photo) {
     let Image { width, height, .. } = *image;
     for (i, value) in image.data.iter_mut().enumerate() {
         let [column, row] = [i % width * mask.width / width, i / width * mask.height / height];

@@ -114,9 +114,11 @@ fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
     }
     let mut first: HashMap<u64, &View> = HashMap::new();
     let (mut same, mut leaks) = (vec![], vec![]);
+    // Beside images in splits, those in none are not used.
+    let has_splits = seen.iter().any(|one| one.view.split.is_some());
     for Seen { view, look } in seen {
         // All images of one colour are equal.
-        if look.sharpness.is_none() {
+        if look.sharpness.is_none() || has_splits && view.split.is_none() {
             continue;
         }
         let Some(other) = first.get(&look.hash) else {
@@ -127,7 +129,6 @@ fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
         match is_trained {
             [Some(true), Some(false)] => leaks.push([*other, *view]),
             [Some(false), Some(true)] => leaks.push([*view, *other]),
-            // Images in no split are not used.
             _ => same.push([*view, *other]),
         }
     }

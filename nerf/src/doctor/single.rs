@@ -39,12 +39,8 @@ pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
     });
     let usual = usual_focals(capture);
     about(Kind::FocalLength, &|camera| {
-        let (Some((focals, usual)), focal) = (usual.get(&[camera.width, camera.height]), camera.focal[0]) else {
-            return false;
-        };
-        let is_other = |focal: f64| !(1.0 / ZOOM..=ZOOM).contains(&(focal / usual));
-        let others = focals.iter().filter(|focal| is_other(**focal)).count();
-        is_other(focal) && others as f64 <= RARE * focals.len() as f64
+        let usual = usual.get(&[camera.width, camera.height]);
+        usual.is_some_and(|usual| is_other(camera.focal[0], *usual))
     });
     about(Kind::PrincipalPoint, &|camera| {
         let sides = [camera.width as f64, camera.height as f64];
@@ -54,17 +50,23 @@ pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
     about(Kind::StrongDistortion, &|camera| reaches(camera) && bends(camera) > BENDS);
 }
 
-/// The horizontal focal lengths of the images of each size, and their median.
-fn usual_focals(capture: &Capture) -> HashMap<[usize; 2], (Vec<f64>, f64)> {
+/// Returns true if a focal length is not about the usual one.
+fn is_other(focal: f64, usual: f64) -> bool {
+    !(1.0 / ZOOM..=ZOOM).contains(&(focal / usual))
+}
+
+/// The usual horizontal focal length of the images of each size, if nearly all have about that.
+fn usual_focals(capture: &Capture) -> HashMap<[usize; 2], f64> {
     let mut of_size: HashMap<[usize; 2], Vec<f64>> = HashMap::new();
     for camera in capture.views.iter().map(|view| &view.camera) {
         of_size.entry([camera.width, camera.height]).or_default().push(camera.focal[0]);
     }
-    let with_median = |focals: Vec<f64>| {
+    let usual = |(size, focals): ([usize; 2], Vec<f64>)| {
         let usual = median(focals.iter().copied());
-        (focals, usual)
+        let others = focals.iter().filter(|focal| is_other(**focal, usual)).count();
+        (others as f64 <= RARE * focals.len() as f64).then_some((size, usual))
     };
-    of_size.into_iter().map(|(size, focals)| (size, with_median(focals))).collect()
+    of_size.into_iter().filter_map(usual).collect()
 }
 
 /// The horizontal (`axis` 0) or vertical field of view in degrees, without distortion.

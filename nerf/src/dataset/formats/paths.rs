@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use unicode_normalization::UnicodeNormalization;
 
 /// Extensions of image files, tried in this order if a name has none.
-const EXTENSIONS: [&str; 9] = ["png", "jpg", "jpeg", "webp", "jfif", "jpe", "tif", "tiff", "bmp"];
+const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "webp", "jfif", "jpe"];
 
-/// Extensions of images that other programs list or that stand beside others: converted before, or not decoded here.
-const OTHERS: [&str; 9] = ["heic", "heif", "avif", "gif", "dng", "arw", "cr2", "nef", "exr"];
+/// Extensions of images that often stand beside others: converted before, or not decoded here.
+const OTHERS: [&str; 12] = ["heic", "heif", "avif", "tif", "tiff", "bmp", "gif", "dng", "arw", "cr2", "nef", "exr"];
 
 /// The longest path, in bytes. Operating systems allow a few times as many at most.
 const LONGEST: usize = 1024;
@@ -90,8 +90,8 @@ pub(super) fn find(folder: &Path, path: &str) -> Option<PathBuf> {
 
 /// The written path of a view's image: its name with the extension of the image.
 pub(super) fn written(name: &str, image: Option<&Path>) -> String {
-    let Some(ending) = image.and_then(Path::to_str).and_then(extension) else { return name.to_owned() };
-    match extension(name) {
+    let Some(ending) = image.and_then(Path::to_str).and_then(any_extension) else { return name.to_owned() };
+    match any_extension(name) {
         None => format!("{name}.{ending}"),
         Some(given) if given.eq_ignore_ascii_case(ending) => {
             format!("{}{ending}", &name[..name.len() - given.len()])

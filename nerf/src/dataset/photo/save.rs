@@ -3,6 +3,7 @@
 use super::{Photo, Values, decoder_within_memory};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
+use image::codecs::bmp::BmpEncoder;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::codecs::tiff::TiffEncoder;
@@ -23,8 +24,8 @@ struct About {
 }
 
 impl Photo {
-    /// Writes the image in the format of the file extension: PNG or TIFF (16 bits where it has them), JPEG of quality 95,
-    /// or lossless WebP.
+    /// Writes the image in the format of the file extension: PNG or TIFF (16 bits where it has them), JPEG of quality
+    /// 95, lossless WebP, or BMP.
     ///
     /// # Errors
     /// If the extension is another, a JPEG would need an alpha channel, or the file cannot be written.
@@ -100,13 +101,16 @@ fn save(decoded: &DynamicImage, path: &Path, about: About) -> Result<()> {
     let mut bytes = vec![];
     let encoded = match ending.as_str() {
         "png" => encode(decoded, PngEncoder::new(&mut bytes), about),
-        "jpg" | "jpeg" if decoded.color().has_alpha() => {
+        "jpg" | "jpeg" | "jfif" | "jpe" if decoded.color().has_alpha() => {
             return Err(Error::file(path, "cannot be written: JPEG has no alpha channel; name the images .png"));
         }
-        "jpg" | "jpeg" => encode(decoded, JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY), about),
+        "jpg" | "jpeg" | "jfif" | "jpe" => {
+            encode(decoded, JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY), about)
+        }
         "webp" => encode(decoded, WebPEncoder::new_lossless(&mut bytes), about),
         // The encoder has no place for EXIF data.
         "tif" | "tiff" => encode(decoded, TiffEncoder::new(Cursor::new(&mut bytes)), About { exif: None, ..about }),
+        "bmp" => encode(decoded, BmpEncoder::new(&mut bytes), About::default()),
         _ => return Err(Error::file(path, "cannot be written: name it .png, .jpg, .webp or .tif")),
     };
     encoded.map_err(|e| Error::file(path, format!("cannot be encoded: {e}")))?;
@@ -143,6 +147,10 @@ mod tests {
                 photo.save(path).unwrap();
                 assert_eq!(Photo::open(path, None).unwrap(), photo);
             }
+            if let Values::Bytes(_) = photo.values {
+                photo.save(folder.path().join("photo.bmp")).unwrap();
+                assert_eq!(Photo::open(folder.path().join("photo.bmp"), None).unwrap(), photo);
+            }
             if let (Values::Bytes(_), true) = (&photo.values, channels == 4) {
                 photo.save(folder.path().join("photo.webp")).unwrap();
                 assert_eq!(Photo::open(folder.path().join("photo.webp"), None).unwrap(), photo);
@@ -153,7 +161,7 @@ mod tests {
         let grey = Photo { width: 16, height: 8, channels: 3, values: Values::Bytes(vec![90; 384]) };
         grey.save(folder.path().join("grey.jpeg")).unwrap();
         assert_eq!(Photo::open(folder.path().join("grey.jpeg"), None).unwrap(), grey);
-        assert!(grey.save(folder.path().join("grey.bmp")).unwrap_err().to_string().contains("name it .png"));
+        assert!(grey.save(folder.path().join("grey.gif")).unwrap_err().to_string().contains("name it .png"));
     }
 
     #[test]

@@ -14,27 +14,29 @@ impl Photo {
 }
 
 /// The variance of the Laplacian of a grey image; 0 if a side is shorter than 3 pixels. `line` returns a row by number.
+/// Pixels that are NaN, and those beside them, do not count.
 pub(crate) fn laplacian_variance([width, height]: [usize; 2], line: impl Fn(usize) -> Vec<f32>) -> f64 {
     if width < 3 || height < 3 {
         return 0.0;
     }
     let mut lines = [line(0), line(1), line(2)];
-    let (mut sum, mut squares) = (0.0, 0.0);
+    let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
     for y in 1..height - 1 {
         let [above, this, below] = &lines;
         for x in 1..width - 1 {
             let [left, right, above, below, middle] =
                 [this[x - 1], this[x + 1], above[x], below[x], this[x]].map(f64::from);
             let value = left + right + above + below - 4.0 * middle;
-            (sum, squares) = (sum + value, squares + value * value);
+            if !value.is_nan() {
+                (count, sum, squares) = (count + 1.0, sum + value, squares + value * value);
+            }
         }
         if y + 2 < height {
             lines.rotate_left(1);
             lines[2] = line(y + 2);
         }
     }
-    let count = ((width - 2) * (height - 2)) as f64;
-    squares / count - (sum / count) * (sum / count)
+    if count == 0.0 { 0.0 } else { squares / count - (sum / count) * (sum / count) }
 }
 
 #[cfg(test)]

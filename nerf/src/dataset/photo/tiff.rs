@@ -1,11 +1,18 @@
 //! The first directory of TIFF files (TIFF 6.0), for what the decoder does not tell.
 
+use std::fs::File;
 use std::io::{BufRead, ErrorKind, Read, Result as IoResult, Seek, SeekFrom};
+use std::path::Path;
 
 /// Tags of the directory.
 const NEW_SUBFILE_TYPE: u16 = 254;
 const EXTRA_SAMPLES: u16 = 338;
+const SAMPLE_FORMAT: u16 = 339;
 const DNG_VERSION: u16 = 50706;
+
+/// Why TIFF files of floats are not decoded, with the fix.
+pub(super) const FLOATS: &str =
+    "is TIFF of floats, whose white is unknown: save images with 8 or 16 bits, and depths as .npy";
 
 /// Returns true for TIFF files and raw images that begin as such, by their first bytes.
 pub(super) fn is_tiff(start: &[u8]) -> bool {
@@ -16,7 +23,8 @@ pub(super) fn is_tiff(start: &[u8]) -> bool {
 ///
 /// Raw images are TIFF files whose first image may be a small preview.
 pub(super) fn refusal(reader: &mut (impl BufRead + Seek)) -> IoResult<Option<String>> {
-    let is_canon = reader.fill_buf()?.get(8..10) == Some(b"CR");
+    // Canon's raw format has a name and a version before its directory, which follows at once.
+    let is_canon = reader.fill_buf()?.get(4..11) == Some(b"\x10\0\0\0CR\x02");
     let entries = match entries(reader) {
         // The decoder says it.
         Err(e) if e.kind() == ErrorKind::UnexpectedEof => vec![],
@@ -27,12 +35,35 @@ pub(super) fn refusal(reader: &mut (impl BufRead + Seek)) -> IoResult<Option<Str
     let is_preview = value(NEW_SUBFILE_TYPE).is_some_and(|bits| bits & 1 == 1);
     let what = if is_canon || is_preview || value(DNG_VERSION).is_some() {
         "is a raw image, which raygrad does not develop: export it as JPEG, or as TIFF of 8 or 16 bits"
+    } else if value(SAMPLE_FORMAT) == Some(3) {
+        FLOATS
     } else if value(EXTRA_SAMPLES) == Some(1) {
         "is TIFF with premultiplied alpha: save it as PNG"
     } else {
         return Ok(None);
     };
     Ok(Some(what.to_owned()))
+}
+
+/// A TIFF file in which all is 0 but its start, its end and what is around its first directory: there are the other
+/// entries.
+pub(super) fn without_pixels(path: &Path) -> IoResult<Vec<u8>> {
+    /// Bytes of each part.
+    const PART: usize = 1 << 18;
+    let mut file = File::open(path)?;
+    let length = usize::try_from(file.metadata()?.len()).unwrap_or(usize::MAX).min(1 << 31);
+    let mut bytes = vec![0; length];
+    let mut read = |bytes: &mut [u8], at: usize| {
+        let part = &mut bytes[at.min(length)..(at + PART).min(length)];
+        file.seek(SeekFrom::Start(at as u64))?;
+        file.read_exact(part)
+    };
+    read(&mut bytes, 0)?;
+    read(&mut bytes, length.saturating_sub(PART))?;
+    let order = if bytes.starts_with(b"II") { u32::from_le_bytes } else { u32::from_be_bytes };
+    let directory = bytes.get(4..8).and_then(|bytes| bytes.try_into().ok()).map_or(0, |bytes| order(bytes) as usize);
+    read(&mut bytes, directory.saturating_sub(PART / 2))?;
+    Ok(bytes)
 }
 
 /// The tag of each entry, and its value if that is a single number of 16 or 32 bits; otherwise 0.
@@ -114,6 +145,7 @@ pub(super) mod tests {
                 ((254, 4, 1), "0.jpg: is a raw image, which raygrad does not develop"),
                 ((254, 3, 5), "0.jpg: is a raw image"),
                 ((50706, 4, 0x0104_0000), "0.jpg: is a raw image"),
+                ((339, 3, 3), "0.jpg: is TIFF of floats, whose white is unknown"),
                 ((338, 3, 1), "0.jpg: is TIFF with premultiplied alpha: save it as PNG"),
             ] {
                 let message = of(&[entry]).unwrap_err().to_string();
@@ -121,14 +153,18 @@ pub(super) mod tests {
             }
         }
         let mut canon = tiff(true, &[]);
-        canon.splice(4..8, [18, 0, 0, 0]);
-        canon.splice(8..10, *b"CR");
+        canon.splice(8..12, *b"CR\x02\0");
+        // The same bytes as pixels of a file whose directory is at its end.
+        let mut pixels = canon.clone();
+        pixels.splice(4..8, [18, 0, 0, 0]);
+        pixels.splice(16..16, [0, 0]);
+        assert_eq!(refusal(&mut std::io::Cursor::new(pixels)).unwrap(), None);
         assert!(refusal(&mut std::io::Cursor::new(canon)).unwrap().unwrap().contains("raw image"));
         for cut in [8, 17, 30] {
             assert_eq!(refusal(&mut std::io::Cursor::new(&tiff(true, &[])[..cut])).unwrap(), None, "{cut}");
         }
         DynamicImage::from(Rgb32FImage::new(2, 2)).save_with_format(&path, image::ImageFormat::Tiff).unwrap();
         let message = Photo::open(&path, None).unwrap_err().to_string();
-        assert!(message.contains("0.jpg: cannot be decoded: its values are floats"), "{message}");
+        assert!(message.contains("0.jpg: is TIFF of floats"), "{message}");
     }
 }

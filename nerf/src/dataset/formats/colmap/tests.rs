@@ -548,13 +548,13 @@ fn lists_of_splits_are_read() {
     assert_eq!(splits(false).unwrap(), ([8, 0, 0, 0], vec![]));
     // Of nerfstudio, with a path and a name that the model lacks.
     list("train_list.txt", &format!("images/{}\n{}\nother.png\n", names[0], names[2]));
-    list("validation_list.txt", &names[4]);
+    list("val_list.txt", &format!("{}\n{}", names[4], names[1]));
     list("test_list.txt", &names[1]);
     let expected = ["`train_list.txt` lists 1 images that the model lacks, such as `other.png`".to_owned()];
     assert_eq!(splits(true).unwrap(), ([3, 2, 1, 2], expected.to_vec()));
     list("test_list.txt", &format!("{}\n{}", names[1], names[0]));
     let message = splits(true).unwrap_err().to_string();
-    let expected = format!("test_list.txt: `line 2`: `{}` is a train image by another list", names[0]);
+    let expected = format!("test_list.txt: `line 2`: `{}` is in train_list.txt too: remove it", names[0]);
     assert!(message.contains(&expected), "{message}");
     assert!(splits(false).is_ok());
 }
