@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use raygrad::nerf::Error;
 
-use super::interrupt::{self, Work};
+use super::interrupt::{self, Stop, Work};
 use super::output::{entries, print, quoted};
 use super::prepare::convert;
 use super::shard::{self, Complete, Progress, Shard};
@@ -36,19 +36,24 @@ pub fn run(args: &Args) -> Work<()> {
     for at in places {
         // The result is beside it, and `.` has no name.
         let at = if at.file_name().is_none() { at.canonicalize().unwrap_or(at) } else { at };
-        let what = match shard::progress(&at)? {
-            Progress::Complete(complete) => {
-                merge(*complete)?;
-                has_merged = true;
-                continue;
+        let named = if at.starts_with(out) { &at } else { out };
+        let what = match shard::progress(&at) {
+            Ok(Progress::Complete(complete)) => match merge(*complete) {
+                Err(Stop::Failed(error)) => Err(error),
+                merged => {
+                    merged?;
+                    has_merged = true;
+                    continue;
+                }
+            },
+            Ok(Progress::None) => continue,
+            Ok(Progress::Merging) => Ok("another raygrad merges the shards: wait until it ends".into()),
+            Ok(Progress::Incomplete(missing)) => {
+                Ok(format!("misses shards {missing}: wait for those that run, repeat the others with --shard"))
             }
-            Progress::None => continue,
-            Progress::Merging => "another raygrad merges the shards: wait until it ends".into(),
-            Progress::Incomplete(missing) => {
-                format!("misses shards {missing}: wait for those that run, repeat the others with --shard")
-            }
+            Err(error) => Err(error),
         };
-        left.get_or_insert_with(|| Error::file(if at.starts_with(out) { &at } else { out }, what));
+        left.get_or_insert_with(|| what.map_or_else(|error| error, |what| Error::file(named, what)));
     }
     let none = || Error::file(out, "holds no shards: name the --out of `render` or `prepare`, or the run of `eval`");
     match left.or_else(|| (!has_merged).then(none)) {

@@ -288,7 +288,8 @@ pub fn assumptions(capture: &Capture) {
 fn inside(scene: &Scene, capture: &Capture) -> Option<PathBuf> {
     let Scene::Folder(folder) = scene else { return None };
     let [own, found] = [folder, &capture.folder].map(|folder| folder.canonicalize().ok());
-    let is_own = own.is_some() && own == found;
+    // Where the scene is a file, that names the capture.
+    let is_own = folder.is_file() || own.is_some() && own == found;
     Some(capture.file.strip_prefix(&capture.folder).ok().filter(|_| is_own)?.to_owned())
 }
 
@@ -364,6 +365,10 @@ mod tests {
         assert_eq!(of(folder.path()), Some("sparse/0/images.bin".into()));
         assert_eq!(of(&folder.path().join("dense/..")), Some("sparse/0/images.bin".into()));
         assert_eq!(of(&inner), None);
+        let file = folder.path().join("transforms_b.json");
+        std::fs::write(&file, "{}").unwrap();
+        let capture = Capture::new(folder.path(), file.clone(), Format::Transforms, vec![]);
+        assert_eq!(inside(&Scene::Folder(file), &capture), Some("transforms_b.json".into()));
         assert_eq!(inside(&Scene::Embedded, &Capture::new(&inner, inner.join("a"), Format::Colmap, vec![])), None);
     }
 

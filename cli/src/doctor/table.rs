@@ -53,7 +53,7 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
         };
         rows.push(("agreement", format!("{agreement:.2}{of}, {word} (0 is chance, 1 is perfect)")));
     } else if facts.compared == 0 {
-        rows.push(("agreement", "not measured: no pinhole or fisheye images".to_owned()));
+        rows.push(("agreement", "not measured: no images with a view to compare".to_owned()));
     } else {
         rows.push(("agreement", "not measured: too few patches match".to_owned()));
     }

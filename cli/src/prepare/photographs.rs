@@ -18,7 +18,7 @@ use crate::progress::Progress;
 const READ: [&str; 6] = ["png", "jpg", "jpeg", "webp", "jfif", "jpe"];
 /// File extensions of images that other programs convert; the content decides.
 const CONVERTED: [&str; 4] = ["heic", "heif", "hif", "avif"];
-/// File extensions of images that count in folders without others: beside those they are often depths, or copies.
+/// File extensions of images that count where others are fewer: beside as many they are often depths, or copies.
 const ALONE: [&str; 4] = ["tif", "tiff", "bmp", "exr"];
 /// File extensions of images that raygrad does not read.
 const NOT_READ: [&str; 9] = ["dng", "cr2", "cr3", "nef", "arw", "orf", "raf", "rw2", "gif"];
@@ -105,8 +105,8 @@ fn is_image(path: &Path) -> bool {
 struct Images {
     /// Sorted by name.
     found: Vec<PathBuf>,
-    /// The number of those that are [no images beside others](ALONE).
-    aside: usize,
+    /// What is said of those that are not used.
+    aside: Option<String>,
     /// The number of those that raygrad cannot read.
     unread: usize,
 }
@@ -121,10 +121,13 @@ impl Images {
         let unread = files.iter().filter(|path| ends(path, &NOT_READ)).count();
         let alone: Vec<PathBuf> = files.iter().filter(|path| ends(path, &ALONE)).cloned().collect();
         files.retain(|path| ends(path, &READ) || ends(path, &CONVERTED));
-        match files.is_empty() {
-            true => Images { found: alone, aside: 0, unread },
-            false => Images { found: files, aside: alone.len(), unread },
+        let some = |count: usize, what: String| (count > 0).then_some(what);
+        if files.len() < alone.len() {
+            let what = format!("{} images are not used: TIFF, BMP and EXR files are more", files.len());
+            return Images { aside: some(files.len(), what), found: alone, unread };
         }
+        let what = format!("{} TIFF, BMP and EXR files are not used: other images are as many or more", alone.len());
+        Images { aside: some(alone.len(), what), found: files, unread }
     }
 }
 
@@ -146,11 +149,8 @@ pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
     if *unread > 0 {
         complain(&format!("warning: {}: {}", place.display(), unreadable(*unread)));
     }
-    if *aside > 0 {
-        complain(&format!(
-            "note: {}: {aside} TIFF, BMP and EXR files beside other images are not used",
-            place.display()
-        ));
+    if let Some(aside) = aside {
+        complain(&format!("note: {}: {aside}", place.display()));
     }
     for (others, other) in all.iter().filter(|(others, other)| !others.found.is_empty() && other != place) {
         let (used, left) = (found.len(), others.found.len());

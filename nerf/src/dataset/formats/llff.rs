@@ -7,7 +7,7 @@
 use super::limits::{MOST_PIXELS, start, unfit_focal};
 use super::locate::{IMAGES, folders, stem};
 use super::npy::Matrix;
-use super::paths::extension;
+use super::paths::{extension, usual_extension};
 use super::{masks, rigid};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -204,12 +204,16 @@ fn images(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
     for folder in places {
         let mut found = names(&folder)?;
         found.retain(|name| is_image(name) && folder.join(name).is_file());
+        // TIFF beside other images are depths, or copies.
+        if found.iter().any(|name| usual_extension(name).is_some()) {
+            found.retain(|name| usual_extension(name).is_some());
+        }
         found.sort();
         if !found.is_empty() {
             return Ok(found.into_iter().map(|name| (name.clone(), folder.join(name))).collect());
         }
     }
-    let what = "has no images (png, jpg, webp): put them in this folder, or in images_4 or images_8";
+    let what = "has no images (png, jpg, webp, tif): put them in this folder, or in images_4 or images_8";
     Err(Error::file(folder.join("images"), what))
 }
 

@@ -4,7 +4,7 @@
 //! the path takes its place. Letter case, Unicode normal form and the extension of an image may differ. Two folders or
 //! files that fit equally well are an error.
 
-use super::paths::{self, any_extension, composed, extension, folded};
+use super::paths::{self, any_extension, composed, extension, folded, usual_extension};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::ffi::{OsStr, OsString};
@@ -243,26 +243,26 @@ impl Directory {
         let mut endings = HashSet::new();
         let is_new = |file: &&OsString| {
             let file = file.to_string_lossy();
-            let ending = extension(&file).filter(|ending| file[..file.len() - ending.len() - 1] == *name);
+            let ending = usual_extension(&file).filter(|ending| file[..file.len() - ending.len() - 1] == *name);
             ending.is_some_and(|ending| endings.insert(ending.to_lowercase()))
         };
         all.iter().filter(is_new).collect()
     }
 
     /// The number of the rule by which files fit a name best, and the files: of the same name, or else in another Unicode normal form, or else in other
-    /// letter case, or else, if `others` is true, with the extension of another image format, of those that are decoded
-    /// first.
+    /// letter case, or else, if `others` is true, with the extension of another image format: of a usual one, or
+    /// else of one that is decoded, or else of any.
     fn of(&self, name: &str, others: bool) -> Option<(usize, Vec<&OsString>)> {
         let all = self.files.get(&stem(name)).map_or(&[][..], Vec::as_slice);
         let fits = |test: &dyn Fn(&str) -> bool| -> Vec<&OsString> {
             all.iter().filter(|file| test(&file.to_string_lossy())).collect()
         };
-        let is_image = |file: &str| others && extension(file).is_some();
-        let rules: [&dyn Fn(&str) -> bool; 5] = [
+        let rules: [&dyn Fn(&str) -> bool; 6] = [
             &|file| file == name,
             &|file| composed(file) == composed(name),
             &|file| folded(file) == folded(name),
-            &is_image,
+            &|file| others && usual_extension(file).is_some(),
+            &|file| others && extension(file).is_some(),
             &|file| others && any_extension(file).is_some(),
         ];
         rules.into_iter().map(fits).enumerate().find(|(_, files)| !files.is_empty())

@@ -9,8 +9,11 @@ use unicode_normalization::UnicodeNormalization;
 /// Extensions of image files, tried in this order if a name has none.
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "webp", "jfif", "jpe"];
 
-/// Extensions of images that often stand beside others: converted before, or not decoded here.
-const OTHERS: [&str; 12] = ["heic", "heif", "avif", "tif", "tiff", "bmp", "gif", "dng", "arw", "cr2", "nef", "exr"];
+/// The same of images that often stand beside those: originals, or depths.
+const BESIDE: [&str; 3] = ["tif", "tiff", "bmp"];
+
+/// Extensions of images that other programs list or that stand beside others: converted before, or not decoded here.
+const OTHERS: [&str; 9] = ["heic", "heif", "avif", "gif", "dng", "arw", "cr2", "nef", "exr"];
 
 /// The longest path, in bytes. Operating systems allow a few times as many at most.
 const LONGEST: usize = 1024;
@@ -65,14 +68,19 @@ fn one_of(path: &str, mut known: impl Iterator<Item = &'static &'static str>) ->
     (!stem.is_empty() && known.any(|known| known.eq_ignore_ascii_case(given))).then_some(given)
 }
 
+/// The extension of a path if it is that of an image file in a usual format.
+pub(super) fn usual_extension(path: &str) -> Option<&str> {
+    one_of(path, EXTENSIONS.iter())
+}
+
 /// The extension of a path if it is that of an image file.
 pub(super) fn extension(path: &str) -> Option<&str> {
-    one_of(path, EXTENSIONS.iter())
+    one_of(path, EXTENSIONS.iter().chain(&BESIDE))
 }
 
 /// The extension of a path if it is that of an image in any format.
 pub(super) fn any_extension(path: &str) -> Option<&str> {
-    one_of(path, EXTENSIONS.iter().chain(&OTHERS))
+    one_of(path, EXTENSIONS.iter().chain(&BESIDE).chain(&OTHERS))
 }
 
 /// Finds a file below `folder`: by its path, with an extension appended, or with its extension in the other case.
@@ -82,7 +90,7 @@ pub(super) fn find(folder: &Path, path: &str) -> Option<PathBuf> {
     };
     let others: Vec<String> = match extension(path) {
         Some(given) => both(&path[..path.len() - given.len() - 1], given).into(),
-        None => EXTENSIONS.iter().flat_map(|extension| both(path, extension)).collect(),
+        None => EXTENSIONS.iter().chain(&BESIDE).flat_map(|extension| both(path, extension)).collect(),
     };
     let names = std::iter::once(path.to_owned()).chain(others);
     names.map(|name| folder.join(name)).find(|path| path.is_file())
@@ -90,8 +98,8 @@ pub(super) fn find(folder: &Path, path: &str) -> Option<PathBuf> {
 
 /// The written path of a view's image: its name with the extension of the image.
 pub(super) fn written(name: &str, image: Option<&Path>) -> String {
-    let Some(ending) = image.and_then(Path::to_str).and_then(any_extension) else { return name.to_owned() };
-    match any_extension(name) {
+    let Some(ending) = image.and_then(Path::to_str).and_then(extension) else { return name.to_owned() };
+    match extension(name) {
         None => format!("{name}.{ending}"),
         Some(given) if given.eq_ignore_ascii_case(ending) => {
             format!("{}{ending}", &name[..name.len() - given.len()])
@@ -130,7 +138,7 @@ mod tests {
     fn paths_find_files_by_extension_and_case() {
         let folder = tempfile::tempdir().unwrap();
         let found = |path: &str| find(folder.path(), path).map(|p| p.strip_prefix(folder.path()).unwrap().to_owned());
-        for name in ["a.png", "b.JPG", "c.jpeg", "d.1.WEBP", "e.PNG", "f.png", "f.jpg", "depth.npy"] {
+        for name in ["a.png", "b.JPG", "c.jpeg", "d.1.WEBP", "e.PNG", "f.png", "f.jpg", "f.tif", "h.TIF", "depth.npy"] {
             std::fs::write(folder.path().join(name), b"").unwrap();
         }
         for (path, expected) in [
@@ -145,6 +153,8 @@ mod tests {
             ("e", "e.PNG"),
             ("f", "f.png"),
             ("f.jpg", "f.jpg"),
+            ("h", "h.TIF"),
+            ("h.tif", "h.TIF"),
             ("depth.npy", "depth.npy"),
         ] {
             assert_eq!(found(path), Some(expected.into()), "{path}");

@@ -45,24 +45,30 @@ pub(super) fn refusal(reader: &mut (impl BufRead + Seek)) -> IoResult<Option<Str
     Ok(Some(what.to_owned()))
 }
 
-/// A TIFF file in which all is 0 but its start, its end and what is around its first directory: there are the other
-/// entries.
+/// A TIFF file in which all is 0 but its start, its end and what is around its directories: the first one, and those of
+/// camera and place that this names.
 pub(super) fn without_pixels(path: &Path) -> IoResult<Vec<u8>> {
     /// Bytes of each part.
     const PART: usize = 1 << 18;
+    /// Tags of entries with the place of a directory.
+    const DIRECTORIES: [u16; 2] = [0x8769, 0x8825];
     let mut file = File::open(path)?;
     let length = usize::try_from(file.metadata()?.len()).unwrap_or(usize::MAX).min(1 << 31);
+    let entries = entries(&mut file).unwrap_or_default();
+    let is_one = |entry: &&(u16, u32)| DIRECTORIES.contains(&entry.0);
+    let places = entries.iter().filter(is_one).map(|entry| entry.1 as usize);
+    let mut head = [0; 8];
+    file.rewind()?;
+    file.read_exact(&mut head)?;
+    let [order @ .., a, b, c, d] = head;
+    let first = if order[0] == b'I' { u32::from_le_bytes([a, b, c, d]) } else { u32::from_be_bytes([a, b, c, d]) };
     let mut bytes = vec![0; length];
-    let mut read = |bytes: &mut [u8], at: usize| {
-        let part = &mut bytes[at.min(length)..(at + PART).min(length)];
-        file.seek(SeekFrom::Start(at as u64))?;
-        file.read_exact(part)
-    };
-    read(&mut bytes, 0)?;
-    read(&mut bytes, length.saturating_sub(PART))?;
-    let order = if bytes.starts_with(b"II") { u32::from_le_bytes } else { u32::from_be_bytes };
-    let directory = bytes.get(4..8).and_then(|bytes| bytes.try_into().ok()).map_or(0, |bytes| order(bytes) as usize);
-    read(&mut bytes, directory.saturating_sub(PART / 2))?;
+    for place in places.chain([first as usize, 0, length]) {
+        let start = place.min(length).saturating_sub(PART / 2);
+        let part = &mut bytes[start..start.saturating_add(PART).min(length)];
+        file.seek(SeekFrom::Start(start as u64))?;
+        file.read_exact(part)?;
+    }
     Ok(bytes)
 }
 
@@ -135,6 +141,17 @@ pub(super) mod tests {
             let red: Vec<f32> = photo.pixels().map(|pixel| (255.0 * pixel[0]).round()).collect();
             assert_eq!(red, [0.0, 10.0, 20.0, 30.0, 40.0, 50.0]);
             assert_eq!(Photo::exif_of_file(&path).unwrap(), Some(tiff(is_little, &[])));
+            // Directories far from the first one and from both ends.
+            let far = 1 << 20;
+            let mut long = tiff(is_little, &[(0x8769, 4, far), (0x8825, 4, 2 * far)]);
+            long.resize(3 << 20, 7);
+            std::fs::write(&path, &long).unwrap();
+            let read = Photo::exif_of_file(&path).unwrap().unwrap();
+            let far = far as usize;
+            for place in [0..1000, far..far + 1000, 2 * far..2 * far + 1000, 3 * far - 1000..3 * far] {
+                assert_eq!(read[place.clone()], long[place]);
+            }
+            assert!(read.len() == long.len() && read[far / 2] == 0, "pixels are not read");
             // A full image, an orientation of 90 degrees, and straight alpha that no pixel has.
             let turned = of(&[(254, 4, 2), (274, 3, 6)]).unwrap();
             assert_eq!([turned.width, turned.height], [2, 3]);
