@@ -800,9 +800,6 @@ fn second_derivatives_of_logarithms_of_sums() {
             assert!((got / expected - 1.0).abs() < 1e-6, "{name} of {logits:?}: {got:e} for {expected:e}");
         }
     }
-    let (zeros, all) = (Tensor::zeros(&[4]), Tensor::full(&[4], 1e38_f32));
-    let slope = along(&|x| x[0].logsumexp(), &zeros, &all);
-    assert!((slope / 1e38 - 1.0).abs() < 1e-6, "{slope:e}");
 }
 
 /// NaN in one row changes nothing in others, which have digits only if a large gradient lifts them.
