@@ -145,6 +145,6 @@ mod tests {
         let radius = mask.used() as f64 / std::f64::consts::PI;
         assert!(radius.sqrt() > 1000.0 && mask.uses(8192, 8192) && !mask.uses(0, 0));
         // Each pixel would take minutes.
-        assert!(start.elapsed().as_secs() < 20, "{:?}", start.elapsed());
+        assert!(start.elapsed().as_secs() < 60, "{:?}", start.elapsed());
     }
 }

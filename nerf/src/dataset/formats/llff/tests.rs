@@ -73,7 +73,7 @@ fn reduced_images_replace_absent_ones() {
     assert_eq!(read(all.path()).unwrap().views[0].name, "2.png", "an empty folder has none");
     let none = folder(&npy(&ROWS), &[]);
     let message = read(none.path()).unwrap_err().to_string();
-    assert!(message.contains("images") && message.contains("has no images (png, jpg, webp)"), "{message}");
+    assert!(message.contains("images") && message.contains("has no images (png, jpg, webp, tif)"), "{message}");
 }
 
 #[test]
@@ -167,7 +167,7 @@ fn images_of_other_folders_and_types_are_found() {
         assert!(said.iter().zip(&notes).all(|(said, note)| said.contains(note)), "{said:?}");
     }
     let message = found(&["photos/0.png", "photos/1.png"]).unwrap_err().to_string();
-    assert!(message.contains("has no images (png, jpg, webp)"), "{message}");
+    assert!(message.contains("has no images (png, jpg, webp, tif)"), "{message}");
     let message = found(&["input/0.png", "input/1.png", "input/2.png"]).unwrap_err().to_string();
     assert!(message.contains("has 2 rows, but there are 3 images in "), "{message}");
 }
