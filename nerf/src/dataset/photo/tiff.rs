@@ -100,13 +100,13 @@ fn entries(reader: &mut (impl Read + Seek)) -> IoResult<Vec<(u16, u32)>> {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
     use super::*;
     use crate::dataset::{Photo, copy_upright};
     use image::{DynamicImage, Rgb32FImage};
 
     /// A grey image of 3 x 2 pixels, 0 and 10 to 50, with more entries: tag, type and value.
-    pub fn tiff(is_little: bool, more: &[(u16, u16, u32)]) -> Vec<u8> {
+    fn tiff(is_little: bool, more: &[(u16, u16, u32)]) -> Vec<u8> {
         let short = |value: u16| if is_little { value.to_le_bytes() } else { value.to_be_bytes() };
         let long = |value: u32| if is_little { value.to_le_bytes() } else { value.to_be_bytes() };
         // Width, height, bits of a sample, compression, colours, place, samples and bytes of the pixels.
