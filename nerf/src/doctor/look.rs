@@ -1,7 +1,7 @@
 //! Measurements of the pixels of one image, from a single read at a small size.
 
-use super::picture::{Picture, grey, hide};
-use crate::dataset::load::{WHITE, used_size};
+use super::picture::{Picture, grey, hide, is_used};
+use crate::dataset::load::used_size;
 use crate::dataset::photo::sharpness::laplacian_variance;
 use crate::dataset::{Capture, Image, Photo, View};
 use crate::error::Result;
@@ -92,11 +92,6 @@ fn used_alone(photo: &Photo, mask: Option<&Photo>) -> Image {
         [pixel[0], pixel[1], pixel[2], alpha]
     });
     Image { channels: 4, data: pixels.collect(), ..image }
-}
-
-/// Returns true for white pixels of a mask.
-pub(super) fn is_used(pixel: [f32; 4]) -> bool {
-    pixel[0] >= WHITE
 }
 
 /// See [`Look::sharpness`].

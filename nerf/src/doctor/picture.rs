@@ -1,7 +1,7 @@
 //! A small grey pinhole image, undistorted from any lens.
 
-use super::look::is_used;
 use crate::camera::{Camera, Lens};
+use crate::dataset::load::WHITE;
 use crate::dataset::{Image, Photo};
 
 /// Half of the width of a patch, in pixels.
@@ -140,6 +140,11 @@ pub(super) fn grey(photo: &Photo, behind: [f32; 3]) -> Image {
     let image = photo.over(behind);
     let data = image.data.chunks_exact(3).map(|rgb| 0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]).collect();
     Image { channels: 1, data, ..image }
+}
+
+/// Returns true for white pixels of a mask.
+pub(super) fn is_used(pixel: [f32; 4]) -> bool {
+    pixel[0] >= WHITE
 }
 
 /// Sets pixels that a mask does not use to unknown.
