@@ -46,9 +46,10 @@ pub struct GeometryOptions {
     /// Box of the mesh or points
     ///
     /// X0,Y0,Z0,X1,Y1,Z1: the lower and the upper corner in capture units, along the axes of the capture. raygrad
-    /// prints the box of each export in this form. [default: the scene box]
-    #[arg(long, help_heading = "Mesh", value_name = "BOX", value_parser = parse::corners, allow_hyphen_values = true)]
-    bounds: Option<[DVec3; 2]>,
+    /// prints the box of each export in this form. scene:X0,Y0,Z0,X1,Y1,Z1 is along the axes of the scene box, in
+    /// scene units; the viewer shows its crop box in this form. [default: the scene box]
+    #[arg(long, help_heading = "Mesh", value_name = "BOX", value_parser = bounds, allow_hyphen_values = true)]
+    bounds: Option<Bounds>,
     /// Decimate the mesh to N triangles
     #[arg(long, help_heading = "Mesh", value_name = "N", conflicts_with = "points")]
     triangles: Option<usize>,
@@ -115,11 +116,31 @@ impl GeometryOptions {
     }
 }
 
+/// The box of `--bounds`: lower and upper corner.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+enum Bounds {
+    /// In capture units, along the axes of the capture.
+    Capture([DVec3; 2]),
+    /// In scene units, along the axes of the scene.
+    Scene([DVec3; 2]),
+}
+
+/// Parses `--bounds`.
+fn bounds(text: &str) -> std::result::Result<Bounds, String> {
+    match text.strip_prefix("scene:") {
+        Some(corners) => parse::corners(corners).map(Bounds::Scene),
+        None => parse::corners(text).map(Bounds::Capture),
+    }
+}
+
 /// Extracts and writes the geometry.
 pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Path, job: &Job) -> Result<()> {
     check_writable(parent(out))?;
     let model = run.model()?;
-    let region = options.bounds.map(|corners| OrientedBox::in_capture(&model.scene_box.transform, corners));
+    let region = options.bounds.map(|bounds| match bounds {
+        Bounds::Capture(corners) => OrientedBox::in_capture(&model.scene_box.transform, corners),
+        Bounds::Scene(corners) => corners.into(),
+    });
     if let Some(line) = region.as_ref().map(|region| beyond(&model, region)).transpose()?.flatten() {
         note(&line);
     }
@@ -274,7 +295,10 @@ mod tests {
         }
         let options = |flags: &str| Flags::parse_from(format!("export {flags}").split_whitespace()).options;
         let config = |flags: &str| options(flags).surface_config(None);
-        assert_eq!(options("--bounds -1,-2,-3,1,2,3").bounds, Some([-1.0, 1.0].map(|x| x * DVec3::new(1.0, 2.0, 3.0))));
+        let corners = [-1.0, 1.0].map(|x| x * DVec3::new(1.0, 2.0, 3.0));
+        assert_eq!(options("--bounds -1,-2,-3,1,2,3").bounds, Some(Bounds::Capture(corners)));
+        assert_eq!(options("--bounds scene:-1,-2,-3,1,2,3").bounds, Some(Bounds::Scene(corners)));
+        assert!(bounds("world:-1,-2,-3,1,2,3").unwrap_err().contains("`world:-1` is not a finite number"));
         let default = SurfaceConfig {
             region: None,
             resolution: None,

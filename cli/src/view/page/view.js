@@ -542,6 +542,12 @@ function makeBox() {
       holder.append(input);
     });
   });
+  tellBox();
+}
+
+/** The command that exports the box. */
+function tellBox() {
+  $("box-command").textContent = `raygrad export RUN mesh.glb --bounds scene:${box().flat().map((x) => Number(x.toPrecision(5)))}`;
 }
 
 /** Slider ends stand for these bounds, so that nothing is cropped. */
@@ -555,6 +561,7 @@ function box() {
 function moveSide(axis, end, value) {
   const [moved, other] = [end, 1 - end].map((i) => $(`box-${"xyz"[axis]}-${i}`));
   moved.value = String((end ? Math.max : Math.min)(value, Number(other.value)));
+  tellBox();
   ask();
 }
 
@@ -826,7 +833,7 @@ function curve(id, name, values, logarithmic) {
 
 // ---- controls -----------------------------------------------------------------------------------------------------------------
 for (const input of document.querySelectorAll("input[name=show], #skip, #own-background, #size, #crop")) {
-  input.addEventListener("change", () => { $("box").hidden = !$("crop").checked; ask(); });
+  input.addEventListener("change", () => { $("box").hidden = $("box-export").hidden = !$("crop").checked; ask(); });
 }
 $("background").addEventListener("input", () => { $("own-background").checked = true; ask(); });
 $("fov").addEventListener("input", () => { free(); view.fov = Number($("fov").value); settled(); });

@@ -358,8 +358,10 @@ const change = (id, name) => { $(id).dispatchEvent(new Event(name)); return call
 is("controls ask", [change("skip", "change"), change("size", "change"), change("own-background", "change")], [["ask"], ["ask"], ["ask"]]);
 set("crop", true);
 is("a box asks", [change("crop", "change"), $("box").hidden, change("box-x-0", "input")], [["ask"], false, ["ask"]]);
+is("a box has a command", [$("box-export").hidden, $("box-command").textContent],
+  [false, "raygrad export RUN mesh.glb --bounds scene:-1,-2,-1.5,1,0.5,3"]);
 set("crop", false);
-is("and goes", [change("crop", "change"), $("box").hidden], [["ask"], true]);
+is("and goes", [change("crop", "change"), $("box").hidden, $("box-export").hidden], [["ask"], true, true]);
 is("a background asks", [change("background", "input"), $("own-background").checked], [["ask"], true]);
 set("own-background", false);
 $("pause").click();
