@@ -13,6 +13,11 @@ use super::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
 /// Width in pixels of the cameras of a built-in scene before they are scaled.
 const SMALL: usize = 8;
 
+/// Renders the images of a split of a built-in scene, so many pixels wide.
+pub fn images(scene: &Scene, split: Split, width: usize) -> Dataset {
+    if *scene == Scene::Landscape { landscape(split, width) } else { embedded(split, width) }
+}
+
 /// Reads the capture of a folder, or builds that of a built-in scene. The images of a built-in scene are `width` pixels
 /// wide, by default as for training. They are written to `folder` if it is given.
 ///
@@ -40,7 +45,7 @@ pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Re
             let cameras = if is_embedded { embedded_cameras(split, SMALL) } else { walk_cameras(split, SMALL) };
             return cameras.into_iter().map(|camera| (camera, None)).collect();
         }
-        let Dataset { frames, .. } = if is_embedded { embedded(split, width) } else { landscape(split, width) };
+        let Dataset { frames, .. } = images(scene, split, width);
         frames.into_iter().map(|Frame { camera, image, .. }| (camera, Some(image))).collect()
     };
     let mut views = vec![];

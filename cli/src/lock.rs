@@ -114,6 +114,15 @@ impl Lock {
         }
     }
 
+    /// Checks that the lock is kept. `gone` and `lost` say of `folder` what else happened.
+    pub fn check(&self, folder: &Path, gone: &str, lost: &str) -> Result<()> {
+        match self.state() {
+            State::Kept => Ok(()),
+            State::Gone => Err(Error::file(folder, gone)),
+            State::Lost => Err(Error::file(folder, lost)),
+        }
+    }
+
     /// Releases the folder and removes the files of the lock.
     pub fn remove(self) {
         // The owner's file first: it may be another's as soon as the lock's file is gone.

@@ -4,7 +4,6 @@ pub mod beside;
 mod bounds;
 mod cameras;
 pub mod convert;
-mod exif;
 mod foreign;
 mod pairs;
 mod photographs;

@@ -9,7 +9,7 @@ use raygrad::nerf::dataset::{
     evenly_spaced,
 };
 use raygrad::nerf::{Error, Result, SceneBox};
-use raygrad_scenes::{embedded, landscape, landscape_distances};
+use raygrad_scenes::landscape_distances;
 use serde::{Deserialize, Serialize};
 
 use super::builtin;
@@ -235,22 +235,14 @@ impl Opened {
     pub fn load_quietly(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
         match &self.capture {
             None => {
-                let data = match self.scene {
-                    Scene::Landscape => {
-                        divides(downscale, LANDSCAPE_SIZE)?;
-                        let mut data = landscape(split, LANDSCAPE_SIZE[0] / downscale);
-                        if self.depth {
-                            let measure =
-                                |frame: &mut Frame| frame.distances = Some(landscape_distances(&frame.camera));
-                            data.frames.iter_mut().for_each(measure);
-                        }
-                        data
-                    }
-                    _ => {
-                        divides(downscale, [EMBEDDED_SIZE; 2])?;
-                        embedded(split, EMBEDDED_SIZE / downscale)
-                    }
-                };
+                let is_landscape = self.scene == Scene::Landscape;
+                let size = if is_landscape { LANDSCAPE_SIZE } else { [EMBEDDED_SIZE; 2] };
+                divides(downscale, size)?;
+                let mut data = builtin::images(&self.scene, split, size[0] / downscale);
+                if is_landscape && self.depth {
+                    let measure = |frame: &mut Frame| frame.distances = Some(landscape_distances(&frame.camera));
+                    data.frames.iter_mut().for_each(measure);
+                }
                 Ok(Dataset {
                     frames: evenly_spaced(data.frames, views),
                     scene_type: self.asked.unwrap_or(data.scene_type),

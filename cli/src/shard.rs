@@ -195,12 +195,8 @@ impl Part {
 
     /// Checks that the folder is still the locked one.
     fn check_lock(&self) -> Result<()> {
-        let what = match self.lock.state() {
-            State::Kept => return Ok(()),
-            State::Gone => "was removed or moved: run the same command to start again",
-            State::Lost => "another raygrad now works on this shard, so this one stopped",
-        };
-        Err(Error::file(&self.folder, what))
+        let gone = "was removed or moved: run the same command to start again";
+        self.lock.check(&self.folder, gone, "another raygrad now works on this shard, so this one stopped")
     }
 }
 

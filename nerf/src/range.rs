@@ -8,6 +8,11 @@ use serde::de::IntoDeserializer;
 use serde::de::value::{Error as Unknown, StrDeserializer};
 use std::fmt;
 
+/// The default of factors in files.
+pub(crate) fn one() -> f64 {
+    1.0
+}
+
 /// The enum variant with this name in files.
 pub(crate) fn by_name<'a, V: Deserialize<'a>>(name: &'a str) -> Option<V> {
     let name: StrDeserializer<'a, Unknown> = name.into_deserializer();

@@ -261,7 +261,8 @@ fn f32_gradients_agree_with_f64() {
             let mut errors: Vec<_> = errors.iter().map(|errors| errors[i]).collect();
             errors.sort_by(f64::total_cmp);
             println!("{preset:?} {name}: median {:.1e}, worst {:.1e}", errors[3], errors[6]);
-            assert!(errors[3] > 0.0 && errors[3] <= 2e-6, "{preset:?} {name}: {errors:?}");
+            let is_close = errors[3] > 0.0 && errors[3] <= 2e-6 && errors.iter().all(|error| *error < 0.1);
+            assert!(is_close, "{preset:?} {name}: {errors:?}");
         }
     }
 }

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use super::interrupt::Work;
-use super::lock::{Lock, State, UNFINISHED as UNFINISHED_LOCK};
+use super::lock::{Lock, UNFINISHED as UNFINISHED_LOCK};
 use super::machine::processor;
 use super::merge;
 use super::output::{checksum, complain, make_folder, note, numbered, other_numbered, print, remove};
@@ -296,10 +296,8 @@ fn result_of(folder: &Path) -> PathBuf {
 
 /// Replaces the result and its page, after the evaluation is complete. The images are in [`new_unfinished`].
 fn finish(report: &Report, folder: &Path, lock: &Lock) -> Result<()> {
-    if lock.state() != State::Kept {
-        let what = "was removed, or another raygrad evaluates there now: nothing was written; run the command again";
-        return Err(Error::file(folder, what));
-    }
+    let what = "was removed, or another raygrad evaluates there now: nothing was written; run the command again";
+    lock.check(folder, what, what)?;
     write_json(&result_of(folder), report)?;
     let (drawn, unfinished) = (report.drawn(), folder.join(UNFINISHED));
     for name in drawn.iter().map(|&i| numbered(i, DIGITS)) {

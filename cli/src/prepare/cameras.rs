@@ -4,14 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use raygrad::nerf::Result;
-use raygrad::nerf::dataset::Photo;
-
-use super::exif::{self, Lens};
+use raygrad::nerf::dataset::{Exif, ExifLens, Photo};
 
 /// An image file, without its pixels.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct About {
-    lens: Option<Lens>,
+    lens: Option<ExifLens>,
     /// Width and height.
     size: [usize; 2],
     /// Latitude and longitude in degrees.
@@ -22,7 +20,7 @@ impl About {
     /// Reads the header of an image file.
     pub fn read(path: &Path) -> Result<Self> {
         let [_, size] = Photo::size_of_file(path)?;
-        let (lens, place) = Photo::exif_of_file(path)?.map_or((None, None), |exif| exif::read(&exif));
+        let Exif { lens, place } = Photo::exif_of_file(path)?;
         Ok(About { lens, size, place })
     }
 }
@@ -37,13 +35,13 @@ pub struct Cameras {
 /// Groups images by lens and size. Images without EXIF data share a camera if all of them have one size, or that size
 /// turned: as portraits and landscapes.
 pub fn group(images: &[About]) -> Cameras {
-    let mut groups: BTreeMap<(&Option<Lens>, [usize; 2]), Vec<usize>> = BTreeMap::new();
+    let mut groups: BTreeMap<(&Option<ExifLens>, [usize; 2]), Vec<usize>> = BTreeMap::new();
     for (i, image) in images.iter().enumerate() {
         groups.entry((&image.lens, image.size)).or_default().push(i);
     }
     let unknown = groups.keys().filter(|(lens, _)| lens.is_none());
     let is_one_size = unknown.map(|(_, [w, h])| [w.min(h), w.max(h)]).collect::<BTreeSet<_>>().len() == 1;
-    let is_shared = |lens: &Option<Lens>, group: &[usize]| group.len() > 1 && (lens.is_some() || is_one_size);
+    let is_shared = |lens: &Option<ExifLens>, group: &[usize]| group.len() > 1 && (lens.is_some() || is_one_size);
     let mut cameras = Cameras { shared: vec![], single: vec![] };
     for ((lens, _), group) in groups {
         if is_shared(lens, &group) { cameras.shared.push(group) } else { cameras.single.extend(group) }
@@ -60,7 +58,7 @@ mod tests {
     #[test]
     fn group_separates_lenses_and_sizes() {
         let image = |lens: Option<u32>, size| {
-            let lens = lens.map(|focal_35mm| Lens { focal_35mm, ..Lens::default() });
+            let lens = lens.map(|focal_35mm| ExifLens { focal_35mm, ..ExifLens::default() });
             About { lens, size, place: None }
         };
         let [wide, tall] = [[4, 3], [3, 4]];

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::shown::Layer;
-use crate::lock::{Lock, State, UNFINISHED};
+use crate::lock::{Lock, UNFINISHED};
 use crate::output::{complain, make_folder, note, numbered, other_numbered, parent, print, remove};
 use crate::overwrite::{Job, png_with_text, taken};
 use crate::parse::read_text;
@@ -203,12 +203,8 @@ impl Frames {
     /// Checks that the folder is still the locked one.
     pub fn check_lock(&self) -> Result<()> {
         let Claim::All(_, lock) = &self.claim else { return Ok(()) };
-        let what = match lock.state() {
-            State::Kept => return Ok(()),
-            State::Gone => "was removed or moved during rendering: run the same command to start again",
-            State::Lost => "another raygrad now renders to it, so this one stopped",
-        };
-        Err(Error::file(&self.folder, what))
+        let gone = "was removed or moved during rendering: run the same command to start again";
+        lock.check(&self.folder, gone, "another raygrad now renders to it, so this one stopped")
     }
 
     /// Keeps the frames and removes the record.

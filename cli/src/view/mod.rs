@@ -37,6 +37,7 @@ use renderer::Renderer;
 use requests::Requests;
 use video_jobs::VideoJobs;
 
+use served::Limits;
 pub use server::Listener;
 pub use training_viewer::TrainingViewer;
 
@@ -105,7 +106,14 @@ pub fn run(args: &Args) -> Result<()> {
     requests.introduce(about(&run, &model, photos.as_deref(), Some(checkpoint::steps(&run)?)));
     let video_jobs = Arc::new(VideoJobs::new(run.clone(), args.scene.clone(), requests.clone()));
     let background = model.config.background.shown();
-    let link = server::serve(args.place.listen()?, requests.clone(), photos.clone(), Some(video_jobs), background)?;
+    let link = server::serve(
+        Limits::USUAL,
+        args.place.listen()?,
+        requests.clone(),
+        photos.clone(),
+        Some(video_jobs),
+        background,
+    )?;
     print(&format!("view     {link}\n         Ctrl-C ends the viewer\n"))?;
     let mut forward = args.open.then(|| ForwardPage::open(&run.folder, &link)).and_then(|opened| match opened {
         Ok(page) => Some(page),

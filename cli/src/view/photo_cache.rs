@@ -6,11 +6,11 @@ use raygrad::nerf::dataset::{Capture, Frame, Photo, Point, Split, View};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Error, Lens, Model, Result};
 use raygrad::tensor::parallel::locked;
-use raygrad_scenes::{embedded, landscape};
 
 use super::cache::{Cache, Cached};
 use super::messages::{AboutPhotograph, rows};
 use super::requests::Requests;
+use crate::builtin;
 use crate::eval::alignment::Appearance;
 use crate::photographs::{learned_transform, present, trained};
 use crate::run::Run;
@@ -171,10 +171,7 @@ impl PhotoCache {
         let mut made = locked(&self.made);
         let frames = match made.take_if(|(split, _)| *split == entry.split) {
             Some((_, frames)) => frames,
-            None => match scene {
-                Scene::Landscape => landscape(entry.split, self.width).frames,
-                _ => embedded(entry.split, self.width).frames,
-            },
+            None => builtin::images(scene, entry.split, self.width).frames,
         };
         let photo = frames.get(entry.number).map(|frame| frame.image.clone());
         *made = Some((entry.split, frames));
@@ -217,6 +214,7 @@ mod tests {
     use raygrad::nerf::dataset::SceneTransform;
     use raygrad::nerf::glam::DAffine3;
     use raygrad::nerf::{Config, Preset, SceneBox};
+    use raygrad_scenes::landscape;
     use std::path::PathBuf;
 
     /// Images of these splits at these positions, looking down.

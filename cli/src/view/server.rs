@@ -67,16 +67,6 @@ impl Listener {
 ///
 /// Fails if the system cannot start a thread.
 pub fn serve(
-    listener: Listener,
-    requests: Arc<Requests>,
-    photos: Option<Arc<PhotoCache>>,
-    video_jobs: Option<Arc<VideoJobs>>,
-    background: [f32; 3],
-) -> raygrad::nerf::Result<String> {
-    serve_within(Limits::USUAL, listener, requests, photos, video_jobs, background)
-}
-
-fn serve_within(
     limits: Limits,
     Listener { listener, address, host }: Listener,
     requests: Arc<Requests>,

@@ -10,6 +10,7 @@ use super::messages::{self, ServerMessage, Taken};
 use super::photo_cache::PhotoCache;
 use super::renderer::Renderer;
 use super::requests::Requests;
+use super::served::Limits;
 use super::server::Listener;
 use super::{about, photos, server, taken};
 use crate::interrupt;
@@ -92,8 +93,14 @@ impl TrainingViewer {
         let (requests, photos) = (Arc::new(Requests::default()), photos(run, None));
         requests.set_share(SHARE);
         requests.introduce(about(run, &trainer.model, photos.as_deref(), None));
-        let link =
-            server::serve(listener, requests.clone(), photos.clone(), None, trainer.model.config.background.shown())?;
+        let link = server::serve(
+            Limits::USUAL,
+            listener,
+            requests.clone(),
+            photos.clone(),
+            None,
+            trainer.model.config.background.shown(),
+        )?;
         print(&format!("view     {link}\n"))?;
         let (renderer, now) = (Renderer::new(requests.clone(), photos.clone(), None), Instant::now());
         let taken = (taken(run, &trainer.model, photos.as_deref()), Rhythm::new(CAMERAS, now));

@@ -3,7 +3,7 @@
 use super::capture::{Capture, View};
 use super::formats;
 use super::frames::{Split, evenly_spaced, pixels_across};
-use super::load::fitting;
+use super::image_size::fitting;
 use super::photo::Header;
 use super::scene_analysis::SceneAnalysis;
 use super::scene_type::SceneType;

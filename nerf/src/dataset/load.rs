@@ -1,35 +1,24 @@
 //! Loading of a capture's images.
 
-use super::capture::{Capture, Format, View};
+use super::capture::{Capture, View};
 use super::depth::{Depths, distances};
-use super::formats;
-use super::frames::{CHOOSE, Dataset, Frame, Split, evenly_spaced};
-use super::hold_out::split_of;
+use super::frames::{Dataset, Frame, Split, evenly_spaced};
+use super::image_size::{made_smaller, size_for};
 use super::lens_mask::seen_pixels;
 use super::mask::Mask;
-use super::photo::{Header, OPAQUE, Photo};
-use super::scene_analysis::{EmptyBackground, SceneAnalysis};
+use super::photo::{Header, Photo};
+use super::scene_analysis::SceneAnalysis;
 use super::scene_transform::SceneTransform;
-use super::scene_type::SceneType;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use crate::memory::{available_memory, gigabytes};
 use glam::DAffine3;
 use raygrad_tensor::parallel::{self, locked};
-use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
-/// Without splits in the files, every this many images by name, from the first, is held out.
-const HELD_OUT: usize = 8;
-/// Images that decide on an empty background.
-const LOOKED_AT: usize = 3;
-/// The transparent share of an image from which its background counts as empty.
-const CLEAR: f64 = 0.05;
-/// The white share of the border from which an image shows an object in front of white.
-const WHITE_BORDER: f64 = 0.98;
 /// The largest downscale factor that is suggested.
 const MOST_DOWNSCALE: u64 = 1 << 14;
 /// The least mask value of a used pixel.
@@ -80,214 +69,6 @@ impl LoadOptions<'_> {
 }
 
 impl Capture {
-    /// Reads the cameras of a folder in any [format](super::formats), without decoding images.
-    ///
-    /// `path` may also be a file that describes a capture: a `.json` file, `poses_bounds.npy`, or a file of a COLMAP
-    /// model. If a folder holds several descriptions, the one with most existing images counts; of equally many, the
-    /// first of `transforms.json`, Blender, COLMAP and LLFF. [`assumptions`](Self::assumptions) states the choice.
-    ///
-    /// Without splits in the files, every eighth image by name, from the first, is a [test](Split::Test) image, even if
-    /// its file does not exist. The others are training images. If the files list only training images, the others are
-    /// test images; if they list only held-out images, the others are training images.
-    ///
-    /// # Errors
-    /// If the path is absent or has no known format, a file has a bad field, or an image is in both the training and
-    /// the test split.
-    pub fn read(path: impl AsRef<Path>) -> Result<Capture> {
-        Capture::read_format(path, None)
-    }
-
-    /// [`read`](Self::read) for a folder with a description in this format.
-    ///
-    /// # Errors
-    /// As [`read`](Self::read), or if there is no description in the format.
-    pub fn read_format(path: impl AsRef<Path>, format: Option<Format>) -> Result<Capture> {
-        formats::read(path.as_ref(), format, true)?.with_default_splits()
-    }
-
-    /// Reads the capture of `folder` by a file that describes it, such as the [`file`](Self::file) of an earlier
-    /// reading.
-    ///
-    /// # Errors
-    /// As [`read`](Self::read), or if the file does not describe a capture.
-    pub fn read_description(folder: impl AsRef<Path>, file: impl AsRef<Path>) -> Result<Capture> {
-        formats::read_file(folder.as_ref(), file.as_ref(), true)?.with_default_splits()
-    }
-
-    /// Reads the capture of `folder` by the file `description` or, without one, as [`read_format`](Self::read_format)
-    /// does, but without splits. [`hold_out`](Self::hold_out) then makes them.
-    ///
-    /// # Errors
-    /// As [`read_format`](Self::read_format), but not if splits are wrong. Blender's files of held-out images are left
-    /// out if they are no JSON, as [`assumptions`](Self::assumptions) say.
-    pub fn read_unsplit(
-        folder: impl AsRef<Path>,
-        description: Option<&Path>,
-        format: Option<Format>,
-    ) -> Result<Capture> {
-        let folder = folder.as_ref();
-        let read = description.map(|file| formats::read_file(folder, file, false));
-        let mut capture = read.unwrap_or_else(|| formats::read(folder, format, false))?;
-        capture.views.iter_mut().for_each(|view| view.split = None);
-        Ok(capture)
-    }
-
-    fn with_default_splits(mut self) -> Result<Capture> {
-        self.split_by_default();
-        self.check_splits()?;
-        Ok(self)
-    }
-
-    /// Returns true if a folder or its parent describes a capture, if the folder holds one below, or if it is an export of
-    /// another program that first needs its own conversion. Other folders of images need poses.
-    pub fn is_described(folder: impl AsRef<Path>) -> bool {
-        formats::is_described(folder.as_ref())
-    }
-
-    fn split_by_default(&mut self) {
-        let held_out = |view: &View| matches!(view.split, Some(Split::Val | Split::Test));
-        if self.views.iter().all(|view| view.split.is_none()) {
-            self.views.sort_by(|a, b| a.name.cmp(&b.name));
-            let few = self.present().count() < 3;
-            let held_out = if few { HashSet::new() } else { self.every(HELD_OUT) };
-            self.hold_out_images(&held_out);
-            return;
-        }
-        // The images that no list has are of the other kind.
-        let is_held_out = self.views.iter().any(held_out);
-        let is_trained = self.views.iter().any(|view| view.split == Some(Split::Train));
-        if !(is_held_out && is_trained) {
-            let other = if is_held_out { Split::Train } else { Split::Test };
-            self.views.iter_mut().for_each(|view| view.split = view.split.or(Some(other)));
-        }
-    }
-
-    /// Returns whether the held-out images are every eighth by name, as [`read`](Self::read) chooses without splits in
-    /// the files.
-    pub fn holds_out_every_eighth(&self) -> bool {
-        let held_out = self.every(HELD_OUT);
-        self.views.len() > 1 && self.views.iter().all(|view| view.split == Some(split_of(view, &held_out)))
-    }
-
-    /// Checks that no held-out image is also trained on.
-    fn check_splits(&self) -> Result<()> {
-        let train = self.present().filter(|view| view.split == Some(Split::Train));
-        let trained: HashMap<&PathBuf, &View> = train.filter_map(|view| Some((view.image.as_ref()?, view))).collect();
-        for view in self.present().filter(|view| view.split != Some(Split::Train)) {
-            if let Some(other) = view.image.as_ref().and_then(|image| trained.get(image)) {
-                let what = format!(
-                    "`{}` is held out, but its image is trained on as {}: remove one of them; {CHOOSE}",
-                    view.name, other.field
-                );
-                return Err(Error::field(&self.file, &view.field, what));
-            }
-        }
-        Ok(())
-    }
-
-    /// Returns the images of a split. A capture with a single held-out set returns it for [`Split::Val`] and
-    /// [`Split::Test`].
-    ///
-    /// # Errors
-    /// If there is none.
-    pub fn split(&self, split: Split) -> Result<Vec<&View>> {
-        let of = |split: Split| self.views.iter().filter(|view| view.split == Some(split)).collect::<Vec<_>>();
-        let other = match split {
-            Split::Train => Split::Train,
-            Split::Val => Split::Test,
-            Split::Test => Split::Val,
-        };
-        let mut found = of(split);
-        if found.is_empty() && self.format != Format::Blender {
-            found = of(other);
-        }
-        if found.is_empty() {
-            let first = self.views.first().filter(|_| self.present().next().is_none());
-            let why = match (first, split) {
-                (Some(view), _) => format!(": none of its images exists, such as `{}`", view.name),
-                (None, Split::Train) => String::new(),
-                (None, _) => format!("; {CHOOSE}"),
-            };
-            return Err(Error::file(&self.file, format!("has no {split} images{why}")));
-        }
-        Ok(found)
-    }
-
-    /// Finds the scene transform, type, box, near and far plane from cameras and a few images; `asked` overrides the
-    /// type.
-    ///
-    /// # Errors
-    /// If an image with an alpha channel cannot be read, if all have one alpha below 1 or 12 bits in 16, or as
-    /// [`SceneAnalysis::new`].
-    pub fn analyze_scene(&self, asked: Option<SceneType>) -> Result<SceneAnalysis> {
-        let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
-        let ([mut clear, mut white, mut alpha, mut hollow], total) = ([0; 4], looked_at.len());
-        let (mut faint, mut low) = (vec![], vec![]);
-        for view in looked_at {
-            let Some(path) = &view.image else { continue };
-            let name = |error| Error::field(&self.file, &view.field, error);
-            let has_alpha = Photo::file_has_alpha(path).map_err(name)?;
-            match Photo::open(path, None) {
-                Ok(photo) => {
-                    let (least, most) = photo.alpha_range();
-                    faint.extend((least == most && most < OPAQUE).then_some((view, most)));
-                    low.extend(photo.unscaled_bits().map(|most| (view, most)));
-                    // A transparent border may be left by undistortion, so it is no sign of an empty background.
-                    clear += usize::from(photo.transparent_share() > CLEAR);
-                    alpha += usize::from(least < 1.0);
-                    hollow += usize::from(photo.is_hollow());
-                    white += usize::from(least >= OPAQUE && photo.white_border() > WHITE_BORDER);
-                }
-                Err(error) if has_alpha => return Err(name(error)),
-                // Loading reports the error.
-                Err(_) => {}
-            }
-        }
-        if let Some((view, most)) = faint.first().filter(|_| faint.len() == total) {
-            let what = format!(
-                "has alpha {:.0} of 255 in every pixel of `{}`, and the other images that were looked at have one value \
-                 too: remove the alpha channel, or make the object opaque in it",
-                255.0 * most,
-                view.name
-            );
-            return Err(Error::field(&self.file, &view.field, what));
-        }
-        if let Some((view, most)) = low.first().filter(|_| low.len() == total) {
-            let what = format!(
-                "has 16 bits per channel in `{}`, but no value above {most} of 65535, nor have the other images that \
-                 were looked at: multiply all values by {}",
-                view.name,
-                match most {
-                    0..256 => 257,
-                    256..1024 => 64,
-                    _ => 16,
-                }
-            );
-            return Err(Error::field(&self.file, &view.field, what));
-        }
-        let empty = match (2 * clear > total, white == total) {
-            (true, _) => Some(EmptyBackground::Transparent),
-            (_, true) => Some(EmptyBackground::White),
-            // An object may fill most of the image. Blender writes an alpha channel without one, too.
-            _ if 2 * alpha > total && self.format == Format::Blender => Some(EmptyBackground::Transparent),
-            _ => None,
-        };
-        Ok(SceneAnalysis { hollow: 2 * hollow > total, ..SceneAnalysis::new(self, empty, asked)? })
-    }
-
-    /// [Analyses](Self::analyze_scene) a scene whose masks [cut out an object](LoadOptions::mask_as_alpha): the
-    /// background is empty.
-    ///
-    /// # Errors
-    /// As [`SceneAnalysis::new`].
-    pub fn analyze_cutout(&self, asked: Option<SceneType>) -> Result<SceneAnalysis> {
-        let analysis = SceneAnalysis::new(self, Some(EmptyBackground::Masks), asked)?;
-        let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
-        // Loading reports errors.
-        let is_hollow = |view: &&&View| self.cutout(view).is_ok_and(|photo| photo.is_hollow());
-        Ok(SceneAnalysis { hollow: 2 * looked_at.iter().filter(is_hollow).count() > looked_at.len(), ..analysis })
-    }
-
     /// Reads one image at full size, in the orientation of its camera, without its mask.
     ///
     /// # Errors
@@ -512,81 +293,9 @@ impl View {
     }
 }
 
-/// The size of an image in the orientation of its camera: as stored, or as shown.
-pub(super) fn size_for(path: &Path, camera: &Camera) -> Result<[usize; 2]> {
-    fitting(&Header::read(path)?, path, camera)
-}
-
-/// The size of an image in the orientation of its camera, from its header.
-pub(super) fn fitting(header: &Header, path: &Path, camera: &Camera) -> Result<[usize; 2]> {
-    used_size(header.sizes, camera).ok_or_else(|| {
-        let (Camera { width, height, .. }, [w, h]) = (camera, header.sizes[0]);
-        let what = format!("has {w}x{h} pixels but its camera {width}x{height}; use one aspect ratio");
-        Error::file(path, what)
-    })
-}
-
 /// Reads an image in the orientation of its camera.
 pub(super) fn open(path: &Path, camera: &Camera) -> Result<Photo> {
     Photo::open(path, Some(size_for(path, camera)?))
-}
-
-/// The image in a folder of downscaled images, such as `images_4` beside `images`, if it has that size, with the
-/// remaining factor; otherwise the image itself. Also its header, and its size in the orientation of its camera.
-fn made_smaller(
-    folder: &Path,
-    path: &Path,
-    camera: &Camera,
-    downscale: usize,
-) -> Result<(PathBuf, Header, [usize; 2], usize)> {
-    let header = Header::read(path)?;
-    let size = fitting(&header, path, camera)?;
-    let inside = path.strip_prefix(folder).unwrap_or(Path::new(""));
-    // The capture itself refers to downscaled images.
-    let factor = formats::factor_of(inside);
-    if factor > 1 {
-        return Ok((path.to_owned(), header, size, downscale.div_ceil(factor)));
-    }
-    let other = (downscale > 1).then(|| smaller_copy(folder, path, inside, downscale)).flatten();
-    let fits = |copy: PathBuf| {
-        let header = Header::read(&copy).ok()?;
-        let own = fitting(&header, &copy, camera).ok()?;
-        let is_of_factor = |i: usize| own[i].abs_diff(size[i] / downscale) <= 1 + size[i] / downscale / 32;
-        (is_of_factor(0) && is_of_factor(1)).then_some((copy, header, own, 1))
-    };
-    Ok(other.and_then(fits).unwrap_or_else(|| (path.to_owned(), header, size, downscale)))
-}
-
-/// The copy of an image `inside` a folder that is downscaled by this factor.
-fn smaller_copy(folder: &Path, path: &Path, inside: &Path, downscale: usize) -> Option<PathBuf> {
-    let mut parts = inside.components();
-    let first = parts.next().and_then(|part| part.as_os_str().to_str()).unwrap_or("");
-    if first != "images" {
-        return None;
-    }
-    let other = folder.join(format!("images_{downscale}")).join(parts.as_path());
-    // An image of that name has a copy of its own.
-    let endings = ["png", "jpg", "JPG", "jpeg", "webp"].into_iter().filter(|end| !path.with_extension(end).is_file());
-    let endings: Vec<PathBuf> = endings.map(|ending| other.with_extension(ending)).collect();
-    [other].into_iter().chain(endings).find(|path| path.is_file())
-}
-
-/// The size of an image in the orientation of its camera, of those [as stored and as shown](Photo::size_of_file).
-pub(crate) fn used_size(sizes: [[usize; 2]; 2], camera: &Camera) -> Option<[usize; 2]> {
-    sizes.into_iter().find(|size| same_shape(*size, camera))
-}
-
-/// Returns true if the aspect ratios of an image and a camera agree, up to the rounding of a side. ffmpeg, and so
-/// nerfstudio, drops the fractions of both sides.
-pub(crate) fn same_shape([width, height]: [usize; 2], camera: &Camera) -> bool {
-    let factor = camera.width / width.max(1);
-    if [width, height] == [camera.width, camera.height].map(|side| side / factor.max(1)) {
-        return true;
-    }
-    let [w, h] = [width as f64, height as f64];
-    let [cw, ch] = [camera.width as f64, camera.height as f64];
-    // Half a pixel of the smaller size, at the scale of the larger.
-    cw > 0.0 && ch > 0.0 && (w * ch - h * cw).abs() <= 0.51 * cw.max(ch).max(w).max(h)
 }
 
 /// Makes the pixels transparent that the mask of a view, if there is one, does not use.

@@ -5,6 +5,7 @@
 
 mod average;
 pub mod background;
+mod background_analysis;
 pub(crate) mod batch;
 pub mod capture;
 pub(crate) mod color_space;
@@ -14,10 +15,12 @@ pub mod formats;
 mod frames;
 mod hold_out;
 pub(crate) mod image;
+pub(crate) mod image_size;
 mod lens_mask;
 pub(crate) mod load;
 mod mask;
 pub(crate) mod photo;
+mod read;
 #[cfg(test)]
 pub(crate) mod sample;
 pub(crate) mod scene_analysis;
@@ -36,9 +39,9 @@ pub use frames::{Dataset, Frame, Split, evenly_spaced};
 pub use hold_out::HoldOut;
 pub use load::LoadOptions;
 pub use mask::Mask;
-pub use photo::Photo;
 pub use photo::save::{copy_cleared, copy_upright};
 pub use photo::unsupported::{ForeignFormat, ForeignImage};
+pub use photo::{Exif, ExifLens, Photo};
 pub use scene_analysis::{EmptyBackground, SceneAnalysis};
 pub use scene_transform::SceneTransform;
 pub use scene_type::SceneType;

@@ -2,7 +2,8 @@
 
 use super::capture::View;
 use super::image::Image;
-use super::load::{WHITE, open, size_for};
+use super::image_size::size_for;
+use super::load::{WHITE, open};
 use super::photo::Photo;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;

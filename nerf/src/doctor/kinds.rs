@@ -84,6 +84,12 @@ kinds! {
         "the focal length of {} is far from that of the other images of the same size",
         "Nothing to do for images of another zoom or lens. Otherwise the focal length is wrong: calibrate these images \
          with the others, or remove them.";
+    /// Focal lengths are far from those of the EXIF data.
+    ExifFocalLength = "exif-focal-length", Warning,
+        "the focal length of {} is far from that of the EXIF data: {}",
+        "A focal length is in pixels of the listed image; if the image was scaled after calibration, scale it too. \
+         `camera_angle_x` is the whole horizontal angle. If COLMAP found this focal length, reconstruct with that of \
+         the EXIF data. If images were cropped or upscaled, this may be right.";
     /// Horizontal and vertical focal lengths differ.
     PixelAspect = "pixel-aspect", Warning,
         "the horizontal and vertical focal lengths of {} differ by more than 5 %",

@@ -1,7 +1,7 @@
 //! Measurements of the pixels of one image, from a single read at a small size.
 
 use super::picture::{Picture, grey, hide, is_used};
-use crate::dataset::load::used_size;
+use crate::dataset::image_size::used_size;
 use crate::dataset::photo::sharpness::laplacian_variance;
 use crate::dataset::{Capture, Image, Photo, View};
 use crate::error::Result;

@@ -88,6 +88,7 @@ fn without_pixels(capture: &Capture, analysis: Option<&SceneAnalysis>, findings:
         finding.severity = Severity::Error;
     }
     single::examine(capture, findings);
+    single::of_exif(capture, findings);
     layout::examine(capture, analysis, findings);
     pixels::without_alpha(capture, analysis, findings);
     let resolutions = pixels::sizes(capture, findings)

@@ -3,7 +3,8 @@
 use super::kinds::{FindingKind as Kind, Severity};
 use super::look::Look;
 use super::report::Findings;
-use crate::dataset::load::{mask_fits, used_size};
+use crate::dataset::image_size::used_size;
+use crate::dataset::load::mask_fits;
 use crate::dataset::{Capture, EmptyBackground, Photo, SceneAnalysis, SceneType, Split, View};
 use crate::error::Result;
 use crate::numbers::{median, spread};

@@ -3,7 +3,7 @@
 use super::kinds::FindingKind as Kind;
 use super::report::Findings;
 use crate::camera::{Camera, Lens};
-use crate::dataset::Capture;
+use crate::dataset::{Capture, Photo, View};
 use crate::numbers::median;
 use std::collections::HashMap;
 
@@ -16,7 +16,7 @@ const ASPECT: f64 = 0.05;
 const OFF_CENTRE: f64 = 0.1;
 /// The distortion at the border, in degrees, above which a lens is reported as strong.
 const BENDS: f64 = 5.0;
-/// The largest usual ratio of two focal lengths, and the largest share of images of one size beyond it that is
+/// The largest usual ratio of two focal lengths, also for square crops of the images of a phone; and the largest share of images of one size beyond it that is
 /// reported: more may have another zoom or lens.
 const ZOOM: f64 = 1.3;
 const RARE: f64 = 0.1;
@@ -48,6 +48,20 @@ pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
     });
     about(Kind::LensFolds, &|camera| !reaches(camera));
     about(Kind::StrongDistortion, &|camera| reaches(camera) && bends(camera) > BENDS);
+}
+
+/// Adds a finding about focal lengths that are not about those of the EXIF data.
+pub(super) fn of_exif(capture: &Capture, findings: &mut Findings) {
+    let expected = |view: &View| {
+        let Camera { width, height, lens, .. } = &view.camera;
+        let exif = Photo::exif_of_file(view.image.as_ref()?).ok().filter(|_| *lens != Lens::Equirectangular)?;
+        exif.focal_pixels([*width, *height])
+    };
+    let known = capture.present().filter_map(|view| Some((view, expected(view)?)));
+    let wrong: Vec<_> = known.filter(|(view, expected)| is_other(view.camera.focal[0], *expected)).collect();
+    let Some((first, expected)) = wrong.first() else { return };
+    let first = format!("{:.0} pixels in `{}`, where {expected:.0} are expected", first.camera.focal[0], first.name);
+    findings.about(Kind::ExifFocalLength, wrong.iter().map(|(view, _)| *view), &[&first]);
 }
 
 /// Returns true if a focal length is not about the usual one.
@@ -137,5 +151,60 @@ pub(super) fn described(lens: &Lens) -> String {
         Lens::Fisheye { k, p, s } => format!("fisheye{}{}{}", listed("k", k), listed("p", p), listed("sx", s)),
         Lens::Fov { omega } => format!("FOV, omega {omega}"),
         Lens::Equirectangular => "equirectangular".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::Format;
+    use glam::DAffine3;
+    use image::codecs::png::PngEncoder;
+    use image::{ExtendedColorType, ImageEncoder};
+
+    /// A PNG of 36 x 24 pixels, the size of the film in millimetres, as a photograph of this focal length.
+    fn photograph(focal_35mm: Option<u8>) -> Vec<u8> {
+        let mut bytes = vec![];
+        let mut encoder = PngEncoder::new(&mut bytes);
+        if let Some(focal) = focal_35mm {
+            let mut exif = b"MM\0*\0\0\0\x08\0\x01\x87\x69\0\x04\0\0\0\x01\0\0\0\x1a\0\0\0\0".to_vec();
+            exif.extend(b"\0\x01\xa4\x05\0\x03\0\0\0\x01\0");
+            exif.extend([focal, 0, 0, 0, 0, 0, 0]);
+            encoder.set_exif_metadata(exif).unwrap();
+        }
+        encoder.write_image(&[99; 36 * 24 * 3], 36, 24, ExtendedColorType::Rgb8).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn focal_lengths_are_those_of_the_exif_data() {
+        let folder = tempfile::tempdir().unwrap();
+        let panorama = Camera { lens: Lens::Equirectangular, ..Camera::from_angle(36, 24, 0.7, DAffine3::IDENTITY) };
+        let pinhole = |focal: f64| Camera { focal: [focal; 2], lens: Lens::Pinhole, ..panorama.clone() };
+        let resized = pinhole(28.0).resized(360, 240);
+        let lost = View::new("lost", "", pinhole(9.0));
+        let views = [
+            (Some(28), pinhole(28.0)),
+            (Some(28), pinhole(35.0)),
+            (Some(28), pinhole(38.0)),
+            (Some(28), pinhole(14.0)),
+            (None, pinhole(14.0)),
+            (Some(0), pinhole(14.0)),
+            (Some(28), panorama.clone()),
+            (Some(28), resized),
+        ];
+        let view = |(i, (focal, camera)): (usize, (Option<u8>, Camera))| {
+            let path = folder.path().join(format!("{i}.png"));
+            std::fs::write(&path, photograph(focal)).unwrap();
+            View { image: Some(path), ..View::new(i.to_string(), "", camera) }
+        };
+        let views = views.into_iter().enumerate().map(view).chain([lost]).collect();
+        let capture = Capture::new(folder.path(), "transforms.json".into(), Format::Transforms, views);
+        let mut findings = Findings::default();
+        of_exif(&capture, &mut findings);
+        let [found] = &findings.sorted(None)[..] else { panic!("not one finding") };
+        assert_eq!((found.kind, &found.views[..]), (Kind::ExifFocalLength, &["2".to_owned(), "3".to_owned()][..]));
+        assert!(found.what.contains("of 2 images is far"), "{}", found.what);
+        assert!(found.what.ends_with(": 38 pixels in `2`, where 28 are expected"), "{}", found.what);
     }
 }

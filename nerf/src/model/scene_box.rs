@@ -18,7 +18,7 @@ pub struct SceneBox {
     pub near_far: [f64; 2],
     /// Length by which the field measures densities: a density of 1 means 1 / `unit`. See [`Space::unit`]. Unit:
     /// scene units. Range: more than 0.
-    #[serde(default = "one")]
+    #[serde(default = "crate::range::one")]
     pub unit: f64,
     /// Number of training images; 0 if unknown.
     #[serde(default)]
@@ -30,10 +30,6 @@ pub struct SceneBox {
     /// Normalised device coordinates of a forward-facing scene; null for other scenes. See [`Space::ndc`].
     #[serde(default)]
     pub ndc: Option<Ndc>,
-}
-
-fn one() -> f64 {
-    1.0
 }
 
 impl SceneBox {

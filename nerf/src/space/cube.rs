@@ -19,15 +19,11 @@ pub struct Space {
     #[serde(default)]
     pub unbounded: bool,
     /// The unit of length of densities, in scene units: a density of 1 is 1 / `unit`. Files of early versions imply 1.
-    #[serde(default = "one")]
+    #[serde(default = "crate::range::one")]
     pub unit: f64,
     /// The NDC frustum of a forward-facing scene, which then maps to the cube instead of all space.
     #[serde(default)]
     pub ndc: Option<Ndc>,
-}
-
-fn one() -> f64 {
-    1.0
 }
 
 /// The longest side of a box in its own units. A new field is then equally opaque for any unit of the scene.

@@ -28,19 +28,15 @@ struct Counts {
     batch: usize,
     collapses: u32,
     /// The lr scale.
-    #[serde(default = "one")]
+    #[serde(default = "crate::range::one")]
     lr_scale: f64,
     /// The share of detail of the fields.
-    #[serde(default = "one")]
+    #[serde(default = "crate::range::one")]
     detail: f64,
     /// The number of parts of the optimizer's state, which is one. Earlier versions had one per group.
     groups: usize,
     /// Settings of the parameters, in their order.
     settings: Vec<Setting>,
-}
-
-fn one() -> f64 {
-    1.0
 }
 
 /// Settings of a parameter.

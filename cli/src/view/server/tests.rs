@@ -22,7 +22,7 @@ fn served_at(host: &str, limits: Limits) -> (String, Arc<Requests>) {
     let requests = Arc::new(Requests::default());
     requests.introduce(r#"{"tell":"about"}"#.to_owned());
     let listener = Listener::bind(host, 0).unwrap();
-    let link = serve_within(limits, listener, requests.clone(), None, None, [1.0; 3]).unwrap();
+    let link = serve(limits, listener, requests.clone(), None, None, [1.0; 3]).unwrap();
     (link.strip_prefix("http://").unwrap().to_owned(), requests)
 }
 
@@ -161,7 +161,7 @@ type Result<T, E> = std::result::Result<T, E>;
 #[test]
 fn server_refuses_other_hosts_and_other_paths() {
     let listener = Listener::bind("127.0.0.1", 0).unwrap();
-    let link = serve(listener, Arc::new(Requests::default()), None, None, [1.0; 3]).unwrap();
+    let link = serve(Limits::USUAL, listener, Arc::new(Requests::default()), None, None, [1.0; 3]).unwrap();
     let (address, token) = parts(&link);
     let port = address.rsplit(':').next().unwrap();
     let taken = Listener::bind("127.0.0.1", port.parse().unwrap()).map(drop).unwrap_err().to_string();

@@ -15,7 +15,7 @@ mod splits;
 mod table;
 mod text;
 
-use super::limits::start;
+use super::limits::{leave_out, start};
 use super::points::Points;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
@@ -170,14 +170,9 @@ fn parse(
     errors.sort_by_key(|(id, _)| *id);
     let error = error.or_else(|| errors.into_iter().next().map(|(_, error)| error));
     let mut assumptions = vec![];
-    if let (Some(name), Some(error)) = (left_out.first(), error) {
-        // A model that is mostly wrong makes a bad scene.
-        if views.len() <= left_out.len() {
-            return Err(error);
-        }
-        let (count, total) = (left_out.len(), left_out.len() + views.len());
-        assumptions
-            .push(format!("left out {count} of {total} images without a valid camera, such as `{name}`: {error}"));
+    let count = left_out.len();
+    if let Some(first) = left_out.into_iter().next().zip(error) {
+        leave_out(count, views.len(), first, &mut assumptions)?;
     }
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let capture = Capture::new(folder, images_file.clone(), Format::Colmap, views);

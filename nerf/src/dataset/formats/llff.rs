@@ -4,7 +4,7 @@
 //! and focal length in pixels. The last two are the nearest and farthest depth. Rows belong to the images of a
 //! folder, usually `images`, in the order of their names, or to those of them that `view_imgs.txt` lists.
 
-use super::limits::{MOST_PIXELS, start, unfit_focal};
+use super::limits::{MOST_PIXELS, leave_out, start, unfit_focal};
 use super::locate::{IMAGES, folders, stem};
 use super::npy::Matrix;
 use super::paths::{extension, usual_extension};
@@ -99,14 +99,8 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
         ));
     }
     let count = left_out.len();
-    if let Some((name, error)) = left_out.into_iter().next() {
-        // Images that are mostly left out make a bad scene.
-        if views.len() <= count {
-            return Err(error);
-        }
-        let total = matrix.rows;
-        assumptions
-            .push(format!("left out {count} of {total} images without a valid camera, such as `{name}`: {error}"));
+    if let Some(first) = left_out.into_iter().next() {
+        leave_out(count, views.len(), first, &mut assumptions)?;
     }
     Ok(Capture { assumptions, ..Capture::new(folder, file, Format::Llff, views) })
 }

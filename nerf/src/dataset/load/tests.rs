@@ -1,5 +1,9 @@
 use super::*;
-use crate::dataset::Image;
+use crate::dataset::capture::Format;
+use crate::dataset::formats;
+use crate::dataset::image::Image;
+use crate::dataset::image_size::{same_shape, smaller_copy};
+use crate::dataset::scene_type::SceneType;
 use glam::DVec3;
 use std::sync::Mutex;
 

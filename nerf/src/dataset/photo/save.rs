@@ -1,6 +1,7 @@
 //! Writing of images to files.
 
-use super::{Photo, Values, decoder_within_memory};
+use super::decode::decoder_within_memory;
+use super::{Photo, Values};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use image::codecs::bmp::BmpEncoder;

@@ -1,4 +1,6 @@
+use super::decode::is_progressive;
 use super::*;
+use image::ImageFormat;
 use proptest::prelude::*;
 
 fn bytes(width: usize, height: usize, channels: usize, values: &[u8]) -> Photo {

@@ -1,14 +1,14 @@
-//! The first directory of TIFF files (TIFF 6.0), for what the decoder does not tell.
+//! TIFF structures (TIFF 6.0): files, for what the decoder does not tell, and EXIF data.
 
-use std::fs::File;
-use std::io::{BufRead, ErrorKind, Read, Result as IoResult, Seek, SeekFrom};
-use std::path::Path;
+use std::io::{BufRead, Read, Result as IoResult, Seek, SeekFrom};
 
-/// Tags of the directory.
+/// Tags of the first directory.
 const NEW_SUBFILE_TYPE: u16 = 254;
 const EXTRA_SAMPLES: u16 = 338;
 const SAMPLE_FORMAT: u16 = 339;
 const DNG_VERSION: u16 = 50706;
+/// The most bytes of a value that are read.
+pub(super) const LONGEST: usize = 64;
 
 /// Why TIFF files of floats are not decoded, with the fix.
 pub(super) const FLOATS: &str =
@@ -25,13 +25,12 @@ pub(super) fn is_tiff(start: &[u8]) -> bool {
 pub(super) fn refusal(reader: &mut (impl BufRead + Seek)) -> IoResult<Option<String>> {
     // Canon's raw format has a name and a version before its directory, which follows at once.
     let is_canon = reader.fill_buf()?.get(4..11) == Some(b"\x10\0\0\0CR\x02");
-    let entries = match entries(reader) {
-        // The decoder says it.
-        Err(e) if e.kind() == ErrorKind::UnexpectedEof => vec![],
-        other => other?,
+    let mut value = {
+        let mut tiff = Tiff::new(&mut *reader);
+        let entries = tiff.as_mut().map_or(vec![], |tiff| tiff.directory(tiff.first));
+        let find = move |tag| entries.iter().find(|entry| entry.tag == tag).copied();
+        move |tag| tiff.as_mut()?.number(find(tag)?)
     };
-    reader.rewind()?;
-    let value = |tag| entries.iter().find(|entry| entry.0 == tag).map(|entry| entry.1);
     let is_preview = value(NEW_SUBFILE_TYPE).is_some_and(|bits| bits & 1 == 1);
     let what = if is_canon || is_preview || value(DNG_VERSION).is_some() {
         "is a raw image, which raygrad does not develop: export it as JPEG, or as TIFF of 8 or 16 bits"
@@ -40,69 +39,110 @@ pub(super) fn refusal(reader: &mut (impl BufRead + Seek)) -> IoResult<Option<Str
     } else if value(EXTRA_SAMPLES) == Some(1) {
         "is TIFF with premultiplied alpha: save it as PNG"
     } else {
-        return Ok(None);
+        ""
     };
-    Ok(Some(what.to_owned()))
+    drop(value);
+    reader.rewind()?;
+    Ok((!what.is_empty()).then(|| what.to_owned()))
 }
 
-/// A TIFF file in which all is 0 but its start, its end and what is around its directories: the first one, and those of
-/// camera and place that this names.
-pub(super) fn without_pixels(path: &Path) -> IoResult<Vec<u8>> {
-    /// Bytes of each part.
-    const PART: usize = 1 << 18;
-    /// Tags of entries with the place of a directory.
-    const DIRECTORIES: [u16; 2] = [0x8769, 0x8825];
-    let mut file = File::open(path)?;
-    let length = usize::try_from(file.metadata()?.len()).unwrap_or(usize::MAX).min(1 << 31);
-    let entries = entries(&mut file).unwrap_or_default();
-    let is_one = |entry: &&(u16, u32)| DIRECTORIES.contains(&entry.0);
-    let places = entries.iter().filter(is_one).map(|entry| entry.1 as usize);
-    let mut head = [0; 8];
-    file.rewind()?;
-    file.read_exact(&mut head)?;
-    let [order @ .., a, b, c, d] = head;
-    let first = if order[0] == b'I' { u32::from_le_bytes([a, b, c, d]) } else { u32::from_be_bytes([a, b, c, d]) };
-    let mut bytes = vec![0; length];
-    for place in places.chain([first as usize, 0, length]) {
-        let start = place.min(length).saturating_sub(PART / 2);
-        let part = &mut bytes[start..start.saturating_add(PART).min(length)];
-        file.seek(SeekFrom::Start(start as u64))?;
-        file.read_exact(part)?;
+/// A TIFF structure. What is absent, damaged or cannot be read is left out.
+pub(super) struct Tiff<R> {
+    reader: R,
+    is_little: bool,
+    /// The place of the first directory.
+    pub first: u64,
+}
+
+/// An entry of a directory.
+#[derive(Clone, Copy)]
+pub(super) struct Entry {
+    pub tag: u16,
+    kind: u16,
+    count: u32,
+    /// Its values, or their place.
+    field: [u8; 4],
+}
+
+impl<R: Read + Seek> Tiff<R> {
+    /// Reads the head.
+    pub fn new(reader: R) -> Option<Self> {
+        let mut tiff = Tiff { reader, is_little: true, first: 0 };
+        let head = tiff.bytes(0, 8);
+        tiff.is_little = head.starts_with(b"II");
+        tiff.first = tiff.long(head.get(4..8)?)?.into();
+        is_tiff(&head).then_some(tiff)
     }
-    Ok(bytes)
-}
 
-/// The tag of each entry, and its value if that is a single number of 16 or 32 bits; otherwise 0.
-fn entries(reader: &mut (impl Read + Seek)) -> IoResult<Vec<(u16, u32)>> {
-    let mut head = [0; 8];
-    reader.read_exact(&mut head)?;
-    let is_little = head[0] == b'I';
-    let short = |bytes: [u8; 2]| if is_little { u16::from_le_bytes(bytes) } else { u16::from_be_bytes(bytes) };
-    let long = |bytes: [u8; 4]| if is_little { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) };
-    let [.., a, b, c, d] = head;
-    reader.seek(SeekFrom::Start(long([a, b, c, d]).into()))?;
-    let mut count = [0; 2];
-    reader.read_exact(&mut count)?;
-    let entry = |_| {
-        let mut entry = [0; 12];
-        reader.read_exact(&mut entry)?;
-        let [tag @ .., _, _, _, _, _, _, _, _, _, _] = entry;
-        let [_, _, kind @ .., _, _, _, _, _, _, _, _] = entry;
-        let [_, _, _, _, values @ .., a, b, c, d] = entry;
-        let value = match (short(kind), long(values)) {
-            (3, 1) => short([a, b]).into(),
-            (4, 1) => long([a, b, c, d]),
-            _ => 0,
+    /// So many bytes from a place, or fewer.
+    fn bytes(&mut self, at: u64, count: usize) -> Vec<u8> {
+        let mut bytes = vec![];
+        // What was read before an error counts.
+        let _ = self.reader.seek(SeekFrom::Start(at)).map(|_| {
+            let _ = self.reader.by_ref().take(count as u64).read_to_end(&mut bytes);
+        });
+        bytes
+    }
+
+    fn short(&self, bytes: &[u8]) -> Option<u16> {
+        let bytes = bytes.first_chunk().copied()?;
+        Some(if self.is_little { u16::from_le_bytes(bytes) } else { u16::from_be_bytes(bytes) })
+    }
+
+    fn long(&self, bytes: &[u8]) -> Option<u32> {
+        let bytes = bytes.first_chunk().copied()?;
+        Some(if self.is_little { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) })
+    }
+
+    /// The entries of the directory at a place.
+    pub fn directory(&mut self, at: u64) -> Vec<Entry> {
+        let count = self.bytes(at, 2);
+        let bytes = self.bytes(at.saturating_add(2), 12 * usize::from(self.short(&count).unwrap_or(0)));
+        let entry = |bytes: &[u8]| {
+            let (tag, kind, count) = (self.short(bytes)?, self.short(&bytes[2..])?, self.long(&bytes[4..])?);
+            Some(Entry { tag, kind, count, field: bytes[8..].first_chunk().copied()? })
         };
-        Ok((short(tag), value))
-    };
-    (0..short(count)).map(entry).collect()
+        bytes.chunks_exact(12).filter_map(entry).collect()
+    }
+
+    /// The bytes of an entry's values: all that an entry of `kind` has, at most [`LONGEST`].
+    fn values(&mut self, entry: Entry, kind: u16, size: usize) -> Vec<u8> {
+        if entry.kind != kind {
+            return vec![];
+        }
+        // Values of up to four bytes are in the entry itself.
+        match (entry.count as usize).saturating_mul(size) {
+            length @ 0..=4 => entry.field[..length].to_vec(),
+            length => self.long(&entry.field).map_or(vec![], |at| self.bytes(at.into(), length.min(LONGEST))),
+        }
+    }
+
+    /// The first number of 16 or 32 bits.
+    pub fn number(&mut self, entry: Entry) -> Option<u32> {
+        let (short, long) = (self.values(entry, 3, 2), self.values(entry, 4, 4));
+        self.short(&short).map(u32::from).or_else(|| self.long(&long))
+    }
+
+    /// The ratio number `i`, if it is finite.
+    pub fn ratio(&mut self, entry: Entry, i: usize) -> Option<f64> {
+        let bytes = self.values(entry, 5, 8);
+        let parts = bytes.chunks_exact(8).nth(i)?;
+        let ratio = f64::from(self.long(parts)?) / f64::from(self.long(&parts[4..])?);
+        ratio.is_finite().then_some(ratio)
+    }
+
+    /// A text up to its first zero.
+    pub fn text(&mut self, entry: Entry) -> Option<String> {
+        let bytes = self.values(entry, 2, 1);
+        let text = bytes.split(|byte| *byte == 0).next().unwrap_or_default();
+        (entry.kind == 2).then(|| String::from_utf8_lossy(text).trim().to_owned())
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::{Photo, copy_upright};
+    use crate::dataset::{Exif, Photo, copy_upright};
     use image::{DynamicImage, Rgb32FImage};
 
     /// A grey image of 3 x 2 pixels, 0 and 10 to 50, with more entries: tag, type and value.
@@ -140,18 +180,20 @@ mod tests {
             assert_eq!([photo.width, photo.height, photo.channels], [3, 2, 3]);
             let red: Vec<f32> = photo.pixels().map(|pixel| (255.0 * pixel[0]).round()).collect();
             assert_eq!(red, [0.0, 10.0, 20.0, 30.0, 40.0, 50.0]);
-            assert_eq!(Photo::exif_of_file(&path).unwrap(), Some(tiff(is_little, &[])));
-            // Directories far from the first one and from both ends.
+            assert_eq!(Photo::exif_of_file(&path).unwrap(), Exif::default());
+            // A directory far from the first one, and an image that ends before another.
             let far = 1 << 20;
-            let mut long = tiff(is_little, &[(0x8769, 4, far), (0x8825, 4, 2 * far)]);
-            long.resize(3 << 20, 7);
+            let mut long = tiff(is_little, &[(0x8769, 4, far), (0x8825, 4, 3 << 20)]);
+            long.resize(2 << 20, 7);
+            let directory = if is_little {
+                b"\x01\0\x05\xa4\x03\0\x01\0\0\0\x1c\0\0\0"
+            } else {
+                b"\0\x01\xa4\x05\0\x03\0\0\0\x01\0\x1c\0\0"
+            };
+            long[far as usize..][..14].copy_from_slice(directory);
             std::fs::write(&path, &long).unwrap();
-            let read = Photo::exif_of_file(&path).unwrap().unwrap();
-            let far = far as usize;
-            for place in [0..1000, far..far + 1000, 2 * far..2 * far + 1000, 3 * far - 1000..3 * far] {
-                assert_eq!(read[place.clone()], long[place]);
-            }
-            assert!(read.len() == long.len() && read[far / 2] == 0, "pixels are not read");
+            let read = Photo::exif_of_file(&path).unwrap();
+            assert_eq!((read.lens.unwrap().focal_35mm, read.place), (28, None));
             // A full image, an orientation of 90 degrees, and straight alpha that no pixel has.
             let turned = of(&[(254, 4, 2), (274, 3, 6)]).unwrap();
             assert_eq!([turned.width, turned.height], [2, 3]);

@@ -1,4 +1,7 @@
-//! The lens and the place of a photograph, from its EXIF data (TIFF 6.0 and CIPA DC-008).
+//! What EXIF data (TIFF 6.0 and CIPA DC-008) say about a photograph.
+
+use super::tiff::{Entry, Tiff};
+use std::io::{Read, Seek};
 
 /// Entries of the first directory.
 const MAKE: u16 = 0x010f;
@@ -11,130 +14,77 @@ const FOCAL_LENGTH_35MM: u16 = 0xa405;
 const LENS_MODEL: u16 = 0xa434;
 /// Entries of the GPS directory: hemisphere and angle, of latitude and longitude.
 const GPS: [[u16; 2]; 2] = [[1, 2], [3, 4]];
-/// The most bytes of a name that count.
-const LONGEST: usize = 64;
+
+/// The lens and the place of a photograph. Absent and damaged entries are left out.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Exif {
+    /// What it was taken with.
+    pub lens: Option<ExifLens>,
+    /// Latitude and longitude in degrees.
+    pub place: Option<[f64; 2]>,
+}
 
 /// What a photograph was taken with. Photographs of one lens are equal.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Default)]
-pub struct Lens {
+pub struct ExifLens {
     /// Maker and model of the camera, and model of the lens.
     pub names: [String; 3],
     /// Focal length in hundredths of a millimetre; 0 if unknown.
     pub focal: u64,
-    /// The same in millimetres of a 35 mm camera, which digital zoom changes.
+    /// The same in millimetres of a 35 mm camera, which digital zoom changes; 0 if unknown.
     pub focal_35mm: u32,
 }
 
-/// Reads the lens and the place, latitude and longitude in degrees. Absent and damaged entries are left out.
-pub fn read(exif: &[u8]) -> (Option<Lens>, Option<[f64; 2]>) {
-    let Some((tiff, first)) = Tiff::new(exif.strip_prefix(b"Exif\0\0").unwrap_or(exif)) else { return (None, None) };
-    let directory = |tag| Some(tiff.number(tiff.entry(first, tag)?)? as usize);
-    let (inner, gps) = (directory(EXIF_DIRECTORY), directory(GPS_DIRECTORY));
-    let text = |at: Option<usize>, tag| at.and_then(|at| tiff.text(tiff.entry(at, tag)?)).unwrap_or_default();
-    let focal = inner.and_then(|at| tiff.ratio(tiff.entry(at, FOCAL_LENGTH)?, 0)).unwrap_or(0.0);
-    let lens = Lens {
-        names: [text(Some(first), MAKE), text(Some(first), MODEL), text(inner, LENS_MODEL)],
-        focal: (100.0 * focal).round() as u64,
-        focal_35mm: inner.and_then(|at| tiff.number(tiff.entry(at, FOCAL_LENGTH_35MM)?)).unwrap_or(0),
-    };
-    let angle = |[side, angle]: [u16; 2]| {
-        let [degrees, minutes, seconds] = [0, 1, 2].map(|i| tiff.ratio(tiff.entry(gps?, angle)?, i));
-        let angle = degrees? + minutes.unwrap_or(0.0) / 60.0 + seconds.unwrap_or(0.0) / 3600.0;
-        let is_negative = matches!(text(gps, side).as_str(), "S" | "W");
-        (angle <= 180.0).then_some(if is_negative { -angle } else { angle })
-    };
-    let place = GPS.map(angle);
-    ((lens != Lens::default()).then_some(lens), place[0].zip(place[1]).map(|(north, east)| [north, east]))
-}
-
-/// A TIFF structure.
-struct Tiff<'a> {
-    bytes: &'a [u8],
-    is_little: bool,
-}
-
-/// An entry of a directory.
-#[derive(Clone, Copy)]
-struct Entry {
-    kind: u16,
-    count: usize,
-    /// Where its values are.
-    at: usize,
-}
-
-impl<'a> Tiff<'a> {
-    /// The structure, and the place of its first directory.
-    fn new(bytes: &'a [u8]) -> Option<(Self, usize)> {
-        let tiff = Tiff { bytes, is_little: bytes.starts_with(b"II") };
-        let is_known = tiff.is_little || bytes.starts_with(b"MM");
-        let first = tiff.long(4)? as usize;
-        (is_known && tiff.short(2) == Some(42)).then_some((tiff, first))
-    }
-
-    fn slice<const N: usize>(&self, at: usize) -> Option<[u8; N]> {
-        self.bytes.get(at..at.checked_add(N)?)?.try_into().ok()
-    }
-
-    fn short(&self, at: usize) -> Option<u16> {
-        let bytes = self.slice(at)?;
-        Some(if self.is_little { u16::from_le_bytes(bytes) } else { u16::from_be_bytes(bytes) })
-    }
-
-    fn long(&self, at: usize) -> Option<u32> {
-        let bytes = self.slice(at)?;
-        Some(if self.is_little { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) })
-    }
-
-    /// The entry of a directory with this tag.
-    fn entry(&self, directory: usize, tag: u16) -> Option<Entry> {
-        let count = usize::from(self.short(directory)?);
-        let places = (0..count).map(|i| directory.saturating_add(2 + 12 * i));
-        let at = places.take_while(|at| *at < self.bytes.len()).find(|at| self.short(*at) == Some(tag))?;
-        let (kind, count) = (self.short(at + 2)?, self.long(at + 4)? as usize);
-        let size: usize = match kind {
-            1 | 2 | 7 => 1,
-            3 => 2,
-            4 => 4,
-            5 => 8,
-            _ => return None,
+impl Exif {
+    /// Reads a TIFF structure.
+    pub(super) fn read(reader: impl Read + Seek) -> Exif {
+        let Some(mut tiff) = Tiff::new(reader) else { return Exif::default() };
+        let main = tiff.directory(tiff.first);
+        let mut inner = |tag| {
+            let entry = main.iter().find(|entry| entry.tag == tag)?;
+            let at = tiff.number(*entry)?;
+            Some(tiff.directory(at.into()))
         };
-        // Values of up to four bytes are in the entry itself.
-        let is_inside = size.checked_mul(count)? <= 4;
-        Some(Entry { kind, count, at: if is_inside { at + 8 } else { self.long(at + 8)? as usize } })
+        let [camera, gps] = [EXIF_DIRECTORY, GPS_DIRECTORY].map(|tag| inner(tag).unwrap_or_default());
+        let find = |directory: &[Entry], tag| directory.iter().find(|entry| entry.tag == tag).copied();
+        let mut text = |directory: &[Entry], tag| find(directory, tag).and_then(|entry| tiff.text(entry));
+        let names = [text(&main, MAKE), text(&main, MODEL), text(&camera, LENS_MODEL)].map(Option::unwrap_or_default);
+        let sides = GPS.map(|[side, _]| text(&gps, side));
+        let focal = find(&camera, FOCAL_LENGTH).and_then(|entry| tiff.ratio(entry, 0)).unwrap_or(0.0);
+        let focal_35mm = find(&camera, FOCAL_LENGTH_35MM).and_then(|entry| tiff.number(entry)).unwrap_or(0);
+        let lens = ExifLens { names, focal: (100.0 * focal).round() as u64, focal_35mm };
+        let mut angle = |i: usize| {
+            let entry = find(&gps, GPS[i][1])?;
+            let [degrees, minutes, seconds] = [0, 1, 2].map(|part| tiff.ratio(entry, part));
+            let angle = degrees? + minutes.unwrap_or(0.0) / 60.0 + seconds.unwrap_or(0.0) / 3600.0;
+            let is_negative = matches!(sides[i].as_deref(), Some("S" | "W"));
+            (angle <= 180.0).then_some(if is_negative { -angle } else { angle })
+        };
+        let place = angle(0).zip(angle(1)).map(|(north, east)| [north, east]);
+        Exif { lens: (lens != ExifLens::default()).then_some(lens), place }
     }
 
-    /// A number of 16 or 32 bits.
-    fn number(&self, entry: Entry) -> Option<u32> {
-        match entry.kind {
-            3 => self.short(entry.at).map(u32::from),
-            4 => self.long(entry.at),
-            _ => None,
-        }
-    }
-
-    /// The ratio number `i`, if it is finite.
-    fn ratio(&self, entry: Entry, i: usize) -> Option<f64> {
-        if entry.kind != 5 || i >= entry.count {
-            return None;
-        }
-        let at = entry.at.checked_add(8 * i)?;
-        let ratio = f64::from(self.long(at)?) / f64::from(self.long(at.checked_add(4)?)?);
-        ratio.is_finite().then_some(ratio)
-    }
-
-    /// A text up to its first zero.
-    fn text(&self, entry: Entry) -> Option<String> {
-        let bytes = self.bytes.get(entry.at..entry.at.checked_add(entry.count.min(LONGEST))?)?;
-        let text = bytes.split(|byte| *byte == 0).next().unwrap_or_default();
-        (entry.kind == 2).then(|| String::from_utf8_lossy(text).trim().to_owned())
+    /// The focal length in pixels of a whole image of this size, by that of a 35 mm camera with the same diagonal field
+    /// of view.
+    pub(crate) fn focal_pixels(&self, [width, height]: [usize; 2]) -> Option<f64> {
+        let focal = f64::from(self.lens.as_ref()?.focal_35mm);
+        let diagonal = (width as f64).hypot(height as f64);
+        (focal > 0.0).then(|| focal / 36.0_f64.hypot(24.0) * diagonal)
     }
 }
 
 #[cfg(test)]
-pub mod tests {
+mod tests {
     use super::*;
+    use crate::dataset::photo::tiff::LONGEST;
     use raygrad_test_support::campaign::campaign;
     use raygrad_test_support::tally::Bound;
+    use std::io::Cursor;
+
+    fn read(bytes: &[u8]) -> (Option<ExifLens>, Option<[f64; 2]>) {
+        let Exif { lens, place } = Exif::read(Cursor::new(bytes));
+        (lens, place)
+    }
 
     /// A value of an entry.
     enum Value {
@@ -208,10 +158,12 @@ pub mod tests {
             let exif = phone(is_little, [51, 10], 26);
             let names = ["Apple", "iPhone 13", "back camera"].map(str::to_owned);
             let (lens, place) = read(&exif);
-            assert_eq!(lens, Some(Lens { names, focal: 510, focal_35mm: 26 }));
+            assert_eq!(lens, Some(ExifLens { names, focal: 510, focal_35mm: 26 }));
             let [north, east] = place.unwrap();
             assert!((north + 33.856_667).abs() < 1e-6 && (east - 151.21).abs() < 1e-6, "{north} {east}");
-            assert_eq!(read(&[b"Exif\0\0".as_slice(), &exif].concat()), (lens, place));
+            // 26 mm before a diagonal of 43.267 mm.
+            let focal = Exif { lens, place }.focal_pixels([3000, 4000]).unwrap();
+            assert!((focal - 3004.626).abs() < 0.001, "{focal}");
         }
         assert_eq!(read(&tiff(true, [vec![], vec![], vec![]])), (None, None));
         assert_eq!(read(b"JFIF"), (None, None));
