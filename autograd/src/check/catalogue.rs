@@ -4,8 +4,9 @@ use crate::cases::Extreme;
 use crate::formula::derived;
 use crate::ops::gradient_op::GradientOp;
 use crate::ops::trigonometric;
-use crate::ops::{Activation, Segments, activation, arithmetic, exponential, linear, matmul, reduce, segment, shape};
-use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, product, scan, select, softmax};
+use crate::ops::{Activation, Segments, activation, arithmetic, cross_entropy, exponential, extremum, layer_norm};
+use crate::ops::{linear, loss, matmul, moments, piecewise, power, product, reduce, scan, segment, select, shape};
+use crate::ops::{softmax, walk};
 use crate::{Cases, Elementwise, Formula, Op};
 use raygrad_tensor::{Shape, Tensor};
 use std::ops::Range;
@@ -185,7 +186,7 @@ fn reductions() -> Vec<Entry> {
         let values = spread(extents, &[-1.5..1.5], 2);
         vec![Tensor::from_fn(extents, |i| if i % every == 1 { 0.0 } else { values.as_slice()[i] })]
     };
-    let walk = |axis, reverse| scan::Walk { axis, reverse };
+    let walk = |axis, reverse| walk::Walk { axis, reverse };
     let wide: &[&[usize]] = &[&[3, 40]];
     let layer_norm_grad = |input| {
         Entry::new(GradientOp { op: layer_norm::LayerNorm { eps: 1e-3 }, input })
@@ -260,16 +261,16 @@ fn reductions() -> Vec<Entry> {
 
 /// Losses.
 fn losses() -> Vec<Entry> {
-    let cross_entropy = |classes: &[u32]| Entry::new(loss::CrossEntropy { classes: classes.into() });
+    let of_classes = |classes: &[u32]| Entry::new(cross_entropy::CrossEntropy { classes: classes.into() });
     vec![
         Entry::new(loss::MeanLoss(loss::SquaredError)).sample(&[&[2, 3], &[2, 3], &[2, 3]]).sample(&[&[], &[], &[]]),
-        Entry::new(loss::MeanCrossEntropy { classes: [2, 0, 2].into() }).sample(&[&[3], &[3, 4]]),
-        cross_entropy(&[2, 0, 2]).sample(&[&[3, 4]]).sample(&[&[3, 40]]).sample(&[&[1, 3, 3]]),
-        Entry::new(GradientOp { op: loss::CrossEntropy { classes: [2, 0, 2].into() }, input: 0 })
+        Entry::new(cross_entropy::MeanCrossEntropy { classes: [2, 0, 2].into() }).sample(&[&[3], &[3, 4]]),
+        of_classes(&[2, 0, 2]).sample(&[&[3, 4]]).sample(&[&[3, 40]]).sample(&[&[1, 3, 3]]),
+        Entry::new(GradientOp { op: cross_entropy::CrossEntropy { classes: [2, 0, 2].into() }, input: 0 })
             .sample(&[&[3, 4], &[3]])
             .sample(&[&[1, 3, 3], &[1, 3]]),
-        cross_entropy(&[1]).sample(&[&[2]]),
-        cross_entropy(&[]).sample(&[&[0, 3]]),
+        of_classes(&[1]).sample(&[&[2]]),
+        of_classes(&[]).sample(&[&[0, 3]]),
     ]
 }
 

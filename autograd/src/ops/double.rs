@@ -1,6 +1,6 @@
 //! Numbers in twice the digits of f64.
 
-use super::scan::Running;
+use super::running::Running;
 
 /// The sum of two numbers, of which the first is the sum rounded to f64.
 #[derive(Debug, Clone, Copy)]

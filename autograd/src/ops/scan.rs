@@ -2,97 +2,11 @@
 
 use super::double::Double;
 use super::gradient_op::{FusedGradient, GradientOp, has_far};
-use super::product::Unbounded;
+use super::running::Running;
+use super::unbounded::Unbounded;
+use super::walk::Walk;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, simd};
-use std::ops::Range;
-
-/// The order in which a scan walks an axis.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Walk {
-    /// The axis.
-    pub axis: usize,
-    /// Whether to walk from the last entry to the first.
-    pub reverse: bool,
-}
-
-impl Walk {
-    fn back(self) -> Self {
-        Walk { reverse: !self.reverse, ..self }
-    }
-
-    fn check(&self, x: &[usize]) -> Result<Shape, ShapeError> {
-        if self.axis < x.len() { Ok(Shape::from_slice(x)) } else { Err(format!("there is no axis {}", self.axis)) }
-    }
-
-    /// Calls `f(state, i)` for every element in the order of the walk. Each line along the axis has one state, which
-    /// starts as `start`. States are wider than the type, so they are not rounded to it.
-    #[inline(always)]
-    fn run<S: Copy>(self, shape: &[usize], start: S, mut f: impl FnMut(&mut S, usize)) {
-        let (count, inner) = (shape[self.axis], shape[self.axis + 1..].iter().product::<usize>());
-        let outer: usize = shape[..self.axis].iter().product();
-        if inner == 1 {
-            // Several lines side by side: in one, each entry waits for the entry before.
-            const LINES: usize = 8;
-            let mut lines = |first: usize, states: &mut [S]| {
-                for step in 0..count {
-                    let entry = if self.reverse { count - 1 - step } else { step };
-                    for (k, state) in states.iter_mut().enumerate() {
-                        f(state, (first + k) * count + entry);
-                    }
-                }
-            };
-            let whole = outer - outer % LINES;
-            (0..whole).step_by(LINES).for_each(|first| lines(first, &mut [start; LINES]));
-            (whole..outer).for_each(|line| lines(line, &mut [start]));
-            return;
-        }
-        walk_rows((0..outer).map(|o| o * count..(o + 1) * count), inner, self.reverse, start, f);
-    }
-
-    /// Entry `i` of the result is the entry that the walk passes before `i` (after it with `next`), and `fill` at the
-    /// end.
-    pub(super) fn neighbour<'t, T: Scalar>(self, x: &Var<'t, T>, next: bool, fill: f64) -> Var<'t, T> {
-        let axis = self.axis as isize;
-        if x.shape()[self.axis] == 0 {
-            return x.clone();
-        }
-        let mut shape = Shape::from_slice(x.shape());
-        shape[self.axis] = 1;
-        let end = x.tape().constant(x.tape().pool().full(&shape, T::from_f64(fill)));
-        if self.reverse == next {
-            Var::concat(&[&end, &x.slice_axis(axis, ..-1)], axis)
-        } else {
-            Var::concat(&[&x.slice_axis(axis, 1..), &end], axis)
-        }
-    }
-}
-
-/// Calls `f(state, i)` for every element of these ranges of rows, with `inner` elements in a row. It walks from the
-/// first row of a range to the last, or in `reverse`. Each column of a range has a state that starts as `start`.
-#[inline(always)]
-pub(super) fn walk_rows<S: Copy>(
-    ranges: impl Iterator<Item = Range<usize>>,
-    inner: usize,
-    reverse: bool,
-    start: S,
-    mut f: impl FnMut(&mut S, usize),
-) {
-    let mut states = vec![start; inner];
-    // Without columns there may be any number of rows.
-    if inner == 0 {
-        return;
-    }
-    for rows in ranges {
-        states.fill(start);
-        for step in 0..rows.len() {
-            let row = if reverse { rows.end - 1 - step } else { rows.start + step };
-            for (j, state) in states.iter_mut().enumerate() {
-                f(state, row * inner + j);
-            }
-        }
-    }
-}
 
 /// A sum carried in twice the digits of its numbers: `f64` for f32, and for f64 the sum and its rounding errors.
 pub(super) trait CarriedSum: Copy + Default {
@@ -168,43 +82,6 @@ impl<T: Scalar> Op<T> for Cumsum {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         Grads::one(cx.tape().apply(Cumsum(self.0.back()), &[cx.g()]))
-    }
-}
-
-/// A running product or sum of products.
-pub(super) trait Running: Copy + From<f64> {
-    /// The product with a number.
-    fn times(self, x: f64) -> Self;
-    /// The product.
-    fn product(self, other: Self) -> Self;
-    /// The sum.
-    fn plus(self, other: Self) -> Self;
-    /// The number in f64.
-    fn value(self) -> f64;
-    /// Whether the number is right, if it is not 0.
-    fn is_in_range(self) -> bool;
-}
-
-impl Running for f64 {
-    #[inline(always)]
-    fn times(self, x: f64) -> f64 {
-        self * x
-    }
-    #[inline(always)]
-    fn product(self, other: f64) -> f64 {
-        self * other
-    }
-    #[inline(always)]
-    fn plus(self, other: f64) -> f64 {
-        self + other
-    }
-    #[inline(always)]
-    fn value(self) -> f64 {
-        self
-    }
-    #[inline(always)]
-    fn is_in_range(self) -> bool {
-        (1e-300..1e300).contains(&self.abs())
     }
 }
 

@@ -1,6 +1,7 @@
 //! Operations along segments: consecutive rows that belong together, such as the samples of a ray.
 
-use super::scan::{CarriedSum, walk_rows};
+use super::scan::CarriedSum;
+use super::walk::walk_rows;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use std::ops::Range;

@@ -2,8 +2,8 @@
 
 use super::double::Double;
 use super::gradient_op::{FusedGradient, GradientOp};
-use super::product::Unbounded;
-use super::scan::Running;
+use super::running::Running;
+use super::unbounded::Unbounded;
 use crate::{Axes, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::scale::{exponent, largest, power_of_two, wide_power};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, Wide, broadcast_shape, simd};
