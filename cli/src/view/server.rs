@@ -33,10 +33,12 @@ pub use super::requests::{sorry, text};
 const HEAD: usize = 1 << 14;
 
 /// The static files.
-const FILES: [(&str, &str, &str); 4] = [
+const FILES: [(&str, &str, &str); 6] = [
     ("/", "text/html; charset=utf-8", include_str!("page/index.html")),
     ("/view.css", "text/css; charset=utf-8", include_str!("page/view.css")),
     ("/camera.js", "text/javascript; charset=utf-8", super::CAMERA),
+    ("/overlays.js", "text/javascript; charset=utf-8", include_str!("page/overlays.js")),
+    ("/path.js", "text/javascript; charset=utf-8", include_str!("page/path.js")),
     ("/view.js", "text/javascript; charset=utf-8", include_str!("page/view.js")),
 ];
 

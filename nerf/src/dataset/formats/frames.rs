@@ -1,7 +1,7 @@
 //! The frames of a JSON file as views.
 
-use super::intrinsics::check_known;
 use super::json::{Object, first_of, unused};
+use super::known::check_known;
 use super::layers::Layers;
 use super::locate::{Located, locate};
 use super::paths::extension;

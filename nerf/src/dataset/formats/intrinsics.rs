@@ -1,10 +1,10 @@
 //! Focal lengths, principal points and sizes: of a whole file, or of a frame of it.
 
-use super::json::{Object, number, shown, truth};
+use super::json::{Object, number, shown};
 use super::layers::Layers;
 use super::lens;
 use super::limits::{unfit_centre, unfit_focal};
-use super::matrix::entries;
+use super::other_names::{MATRICES, OtherNames, agreeing, matrix_of, unread_matrix, unusable};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::Result;
@@ -12,84 +12,12 @@ use glam::DAffine3;
 use serde_json::{Map, Value};
 use std::f64::consts::PI;
 
-/// Unsupported camera fields of instant-ngp and nerfstudio. Ignoring them silently would spoil every image.
-const NOT_READ: [&str; 18] = [
-    "x_fov",
-    "y_fov",
-    "distortion_params",
-    "fisheye_crop_radius",
-    "ftheta_p0",
-    "ftheta_p1",
-    "ftheta_p2",
-    "ftheta_p3",
-    "ftheta_p4",
-    "latlong",
-    "equirectangular",
-    "rolling_shutter",
-    "rolling_shutter_time",
-    "transform_matrix_start",
-    "transform_matrix_end",
-    "black_transparent",
-    "normal_mts_args",
-    "from_na",
-];
-
-/// Names of texts that state the axes or the direction of the matrices. Those that name others than OpenGL's count.
-const CONVENTIONS: [&str; 9] = [
-    "convention",
-    "frame_convention",
-    "camera_convention",
-    "pose_convention",
-    "axis_convention",
-    "coordinate_convention",
-    "coordinate_system",
-    "coord_system",
-    "pose_type",
-];
-const OTHER_CONVENTIONS: [&str; 6] = ["opencv", "colmap", "w2c", "world2cam", "world_to_cam", "world-to-cam"];
-
-/// Lists of distortion coefficients in other programs. They count where none are given by name.
-const DISTORTIONS: [&str; 9] = [
-    "dist_coeffs",
-    "dist_coefs",
-    "distCoeffs",
-    "D",
-    "dist",
-    "distortion",
-    "distortion_coefficients",
-    "radial_distortion",
-    "tangential_distortion",
-];
-
-/// Texts in other programs that name a kind of camera. Those that name a wide one count.
-const KINDS: [&str; 4] = ["camera_type", "projection", "fisheye", "distortion_model"];
-const WIDE: [&str; 4] = ["fish", "equidistant", "equirect", "spherical"];
-
-/// Names of an intrinsic matrix (focal lengths on the diagonal, the principal point in the last column), and of a list or
-/// object of fx, fy, cx and cy.
-const MATRICES: [&str; 8] = [
-    "K",
-    "intrinsics",
-    "camera_intrinsics",
-    "intrinsic_matrix",
-    "camera_matrix",
-    "cam_K",
-    "intrinsic",
-    "cam_intrinsic",
-];
-
 /// Names of a focal length that may be in millimetres, and of a field of view that may be in degrees.
 const UNCLEAR: [&str; 8] = ["focal_length", "focal", "fov", "fovx", "fov_x", "FovX", "hfov", "field_of_view"];
-
-/// What is wrong with a matrix with another entry than a finite number.
-const NOT_FINITE: &str = "must have finite numbers";
 
 /// The least focal length of other names than instant-ngp's, as a share of the image's side: some are in units of the
 /// side.
 const SHORTEST: f64 = 0.05;
-
-/// The largest difference of two values of a length, in pixels.
-const SAME: f64 = 0.01;
 
 /// Limits of a camera's lengths in pixels.
 const CENTRE: f64 = 1e9;
@@ -111,93 +39,6 @@ const DIFFERS: f64 = 0.01;
 
 /// The relative tolerance of a panorama's fields.
 const PANORAMA: f64 = 0.01;
-
-/// Checks that an object has no unsupported camera field, unless its value has no effect.
-///
-/// # Errors
-/// If it has one.
-pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
-    fn nothing(value: &Value) -> bool {
-        match value {
-            Value::Array(values) => values.iter().all(nothing),
-            Value::Object(members) => members.values().all(nothing),
-            value => truth(value) == Some(false),
-        }
-    }
-    // A number is a distance, and a text such as "none" no coefficient.
-    let is_list = |value: &Value| value.is_array() || value.is_object();
-    let lists = DISTORTIONS.iter().filter(|name| object.get("k1").is_none() && object.get(name).is_some_and(is_list));
-    let has_one = |name: &str, words: &[&str]| {
-        let text = object.get(name).and_then(Value::as_str).map(str::to_lowercase);
-        text.is_some_and(|text| words.iter().any(|word| text.contains(word)))
-    };
-    let is_fisheye = object.get("fisheye").and_then(Value::as_bool) == Some(true);
-    let is_wide = |name: &&&str| {
-        object.get("camera_model").is_none() && (has_one(name, &WIDE) || **name == "fisheye" && is_fisheye)
-    };
-    let conventions = CONVENTIONS.iter().filter(|name| has_one(name, &OTHER_CONVENTIONS));
-    let all = NOT_READ.iter().chain(lists).chain(KINDS.iter().filter(is_wide)).chain(conventions);
-    let named = all.copied().find_map(|name| Some((name, object.get(name).filter(|value| !nothing(value))?)));
-    let Some((name, value)) = named else { return Ok(()) };
-    let what = match name {
-        "x_fov" | "y_fov" => "write the field of view in radians as camera_angle_x and camera_angle_y",
-        "latlong" | "equirectangular" => "write camera_model EQUIRECTANGULAR for such panoramas",
-        "distortion_params" => "write the coefficients by name (k1, k2, p1, p2) with their camera_model",
-        name if DISTORTIONS.contains(&name) => {
-            "write the coefficients by name (k1, k2, p1, p2) with their camera_model; OpenCV lists k1, k2, p1, p2, k3"
-        }
-        "fisheye_crop_radius" => "write masks of the pixels to use, as mask_path",
-        name if KINDS.contains(&name) => {
-            "write camera_model OPENCV_FISHEYE, another fisheye model or EQUIRECTANGULAR, with its coefficients"
-        }
-        "rolling_shutter" | "rolling_shutter_time" | "transform_matrix_start" | "transform_matrix_end" => {
-            "rolling shutter is not supported; remove it to ignore it"
-        }
-        "normal_mts_args" => {
-            "it means axes of Mitsuba: negate the first and the third column of all matrices, and remove it"
-        }
-        "from_na" => {
-            "it means axes of OpenCV (NeuS2): negate the second and the third column of all matrices, and remove it"
-        }
-        name if CONVENTIONS.contains(&name) => {
-            "matrices are camera-to-world with OpenGL's axes (y up, looking along -z): convert them, and remove it"
-        }
-        "black_transparent" => "write the transparency into the images; remove it to ignore it",
-        _ => "such cameras are not supported; remove it to ignore it",
-    };
-    Err(object.error(name, format!("is {}, which raygrad does not read: {what}", shown(value))))
-}
-
-/// The first [intrinsic matrix](MATRICES) of an object, with its name and its entries. Values of other shapes belong to
-/// other programs.
-fn matrix_of<'a>(object: &'a Object<'_>) -> Option<(&'static str, &'a Value, Vec<&'a Value>)> {
-    MATRICES.into_iter().find_map(|name| {
-        let value = object.get(name)?;
-        Some((name, value, entries_of(value)?))
-    })
-}
-
-/// The first value under the name of an [intrinsic matrix](MATRICES) that is none.
-fn unread_matrix<'a>(object: &'a Object<'_>) -> Option<(&'static str, &'a Value)> {
-    let of_name =
-        |name| Some((name, object.get(name).filter(|value| !value.is_null() && entries_of(value).is_none())?));
-    MATRICES.into_iter().find_map(of_name)
-}
-
-/// What is wrong with an [intrinsic matrix](MATRICES) that some programs write for images without a camera.
-fn unusable(entries: &[&Value]) -> Option<&'static str> {
-    let second = match entries.len() {
-        4 => 1,
-        9 => 4,
-        _ => 5,
-    };
-    let is_lost = |value: &&Value| value.is_null() || number(value).is_some_and(|x| !x.is_finite());
-    if entries.iter().any(is_lost) {
-        return Some(NOT_FINITE);
-    }
-    let is_no_length = |i: usize| number(entries[i]).is_some_and(|f| f <= 0.0);
-    [0, second].into_iter().any(is_no_length).then_some("must have focal lengths above 0")
-}
 
 impl Layers<'_, '_> {
     /// Checks that the frame's own principal point is finite, and its focal lengths or fields of view above 0, as far as
@@ -518,78 +359,6 @@ fn contradiction(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Option
 /// The focal length in pixels of a field of view across `side` pixels.
 fn focal_length(side: usize, angle: f64) -> f64 {
     0.5 * side as f64 / (0.5 * angle).tan()
-}
-
-/// The focal lengths and the principal point of an object, under other names than instant-ngp's.
-#[derive(Default)]
-struct OtherNames {
-    /// The member that has them.
-    name: &'static str,
-    /// fx, fy, cx and cy.
-    lengths: [Option<f64>; 4],
-}
-
-impl OtherNames {
-    fn of(object: &Object<'_>) -> Result<Self> {
-        if let Some((name, value, entries)) = matrix_of(object) {
-            let m: Option<Vec<f64>> = entries.iter().map(|x| number(x)).collect();
-            let lengths = match (unusable(&entries), m) {
-                (None, Some(m)) => lengths(&m, value.is_object()),
-                (what, _) => Err(what.unwrap_or(NOT_FINITE)),
-            };
-            let lengths = lengths.map_err(|what| object.error(name, format!("{what}, is {}", shown(value))))?;
-            return Ok(OtherNames { name, lengths: lengths.map(Some) });
-        }
-        if ["fl_x", "fl_y"].iter().any(|name| object.get(name).is_some()) {
-            return Ok(OtherNames::default());
-        }
-        let [fx, fy] = [object.positive("fx")?, object.positive("fy")?];
-        Ok(OtherNames { name: if fx.is_some() { "fx" } else { "fy" }, lengths: [fx, fy, None, None] })
-    }
-}
-
-/// The entries of a 3x3, 3x4 or 4x4 matrix, row by row, or fx, fy, cx and cy of a list or an object of nothing else.
-fn entries_of(value: &Value) -> Option<Vec<&Value>> {
-    match value {
-        Value::Object(members) if members.len() == 4 => {
-            ["fx", "fy", "cx", "cy"].into_iter().map(|name| members.get(name)).collect()
-        }
-        Value::Array(list) if list.len() == 4 && !list.iter().any(Value::is_array) => Some(list.iter().collect()),
-        value => entries(value, 3)
-            .filter(|entries| entries.len() == 9)
-            .or_else(|| entries(value, 4).filter(|entries| matches!(entries.len(), 12 | 16))),
-    }
-}
-
-/// fx, fy, cx and cy of their list, which may be `named`, or of an intrinsic matrix; or an error message.
-fn lengths(m: &[f64], named: bool) -> std::result::Result<[f64; 4], &'static str> {
-    if let [fx, fy, cx, cy] = *m {
-        // COLMAP lists a focal length, cx, cy and a coefficient.
-        let is_in_order = (0.67..1.5).contains(&(fx / fy)) && (0.25..4.0).contains(&(cx / cy));
-        return if named || is_in_order { Ok([fx, fy, cx, cy]) } else { Err("must be fx, fy, cx, cy in this order") };
-    }
-    let columns = if m.len() == 9 { 3 } else { 4 };
-    let at = |row: usize, column: usize| m[row * columns + column];
-    let is_nothing = |values: [f64; 2]| values.iter().all(|x| x.abs() <= SAME);
-    let is_rest_nothing = (0..m.len()).all(|i| i % columns < 3 && i / columns < 3 || m[i] == f64::from(i == 15));
-    // Some programs store columns. Only the principal point can stand outside of the diagonal.
-    let [right, below] = [[at(0, 2), at(1, 2)], [at(2, 0), at(2, 1)]];
-    let (centre, other) = if right == [0.0; 2] { (below, right) } else { (right, below) };
-    match is_nothing([at(0, 1), at(1, 0)]) && other == [0.0; 2] && at(2, 2) == 1.0 && is_rest_nothing {
-        true => Ok([at(0, 0), at(1, 1), centre[0], centre[1]]),
-        false => Err("must have the rows fx 0 cx, 0 fy cy and 0 0 1"),
-    }
-}
-
-/// A length that is given by its own member, by the other names, or equally by both.
-fn agreeing(object: &Object<'_>, name: &str, others: &OtherNames, i: usize) -> Result<Option<f64>> {
-    match (object.number(name)?, others.lengths[i]) {
-        (Some(own), Some(other)) if !((own - other).abs() <= SAME) => {
-            let field = object.field(others.name);
-            Err(object.error(name, format!("is {own}, but `{field}` has {other}: remove one of them")))
-        }
-        (own, other) => Ok(own.or(other)),
-    }
 }
 
 /// Writes everything of a camera except its pose, for the model `model`.
