@@ -46,7 +46,7 @@ pub struct GeometryOptions {
     /// Box of the mesh or points
     ///
     /// X0,Y0,Z0,X1,Y1,Z1: the lower and the upper corner in capture units, along the axes of the capture. raygrad
-    /// prints the box of each export in this form. scene:X0,Y0,Z0,X1,Y1,Z1 is along the axes of the scene box, in
+    /// prints the extent of each mesh in this form. scene:X0,Y0,Z0,X1,Y1,Z1 is along the axes of the scene box, in
     /// scene units; the viewer shows its crop box in this form. [default: the scene box]
     #[arg(long, help_heading = "Mesh", value_name = "BOX", value_parser = bounds, allow_hyphen_values = true)]
     bounds: Option<Bounds>,

@@ -183,6 +183,7 @@ mod tests {
         let pinhole = |focal: f64| Camera { focal: [focal; 2], lens: Lens::Pinhole, ..panorama.clone() };
         let resized = pinhole(28.0).resized(360, 240);
         let lost = View::new("lost", "", pinhole(9.0));
+        let unsized_camera = Camera { width: 0, height: 0, ..pinhole(28.0) };
         let views = [
             (Some(28), pinhole(28.0)),
             (Some(28), pinhole(35.0)),
@@ -192,6 +193,7 @@ mod tests {
             (Some(0), pinhole(14.0)),
             (Some(28), panorama.clone()),
             (Some(28), resized),
+            (Some(28), unsized_camera),
         ];
         let view = |(i, (focal, camera)): (usize, (Option<u8>, Camera))| {
             let path = folder.path().join(format!("{i}.png"));

@@ -1,11 +1,11 @@
 //! The frames of a JSON file as views.
 
 use super::json::{Object, first_of, unused};
-use super::known::check_known;
 use super::layers::Layers;
 use super::locate::{Located, locate};
 use super::paths::extension;
 use super::points::reason;
+use super::unsupported::check_supported;
 use super::{masks, matrix, paths};
 use crate::dataset::capture::View;
 use crate::dataset::photo::{Header, Photo};
@@ -56,7 +56,7 @@ impl Frames {
         let mut out = Frames::default();
         let mut frames = vec![];
         for top in tops {
-            check_known(top)?;
+            check_supported(top)?;
             frames.push(top.frames()?);
         }
         let all: Vec<&Object<'_>> = frames.iter().flatten().collect();
@@ -120,7 +120,7 @@ impl Frames {
         let mut views = Vec::with_capacity(frames.len());
         let (mut rounded, mut blunt, mut shared) = (vec![], vec![], vec![]);
         for (i, (frame, (name, image))) in frames.iter().zip(images).enumerate() {
-            check_known(frame)?;
+            check_supported(frame)?;
             if frame.flag("is_bad")? == Some(true) {
                 self.bad.push(name.clone());
                 self.left_out.insert(name.clone());

@@ -1,4 +1,4 @@
-//! Limits for the contents of a capture's files.
+//! Limits for the contents of a capture's files, and what becomes of images beyond them.
 
 use crate::error::{Error, Result};
 use std::ops::RangeInclusive;

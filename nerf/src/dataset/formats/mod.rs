@@ -11,7 +11,6 @@ mod exports;
 mod frames;
 mod intrinsics;
 mod json;
-mod known;
 mod layers;
 mod lens;
 mod limits;
@@ -27,6 +26,7 @@ mod ply;
 mod points;
 pub mod rigid;
 pub mod transforms;
+mod unsupported;
 
 pub(super) use description::{is_described, read, read_file};
 pub(super) use locate::{DEEPEST, factor_of, fitting};

@@ -69,7 +69,7 @@ impl Exif {
     pub(crate) fn focal_pixels(&self, [width, height]: [usize; 2]) -> Option<f64> {
         let focal = f64::from(self.lens.as_ref()?.focal_35mm);
         let diagonal = (width as f64).hypot(height as f64);
-        (focal > 0.0).then(|| focal / 36.0_f64.hypot(24.0) * diagonal)
+        (focal > 0.0 && diagonal > 0.0).then(|| focal / 36.0_f64.hypot(24.0) * diagonal)
     }
 }
 

@@ -25,25 +25,21 @@ pub(super) fn is_tiff(start: &[u8]) -> bool {
 pub(super) fn refusal(reader: &mut (impl BufRead + Seek)) -> IoResult<Option<String>> {
     // Canon's raw format has a name and a version before its directory, which follows at once.
     let is_canon = reader.fill_buf()?.get(4..11) == Some(b"\x10\0\0\0CR\x02");
-    let mut value = {
-        let mut tiff = Tiff::new(&mut *reader);
-        let entries = tiff.as_mut().map_or(vec![], |tiff| tiff.directory(tiff.first));
-        let find = move |tag| entries.iter().find(|entry| entry.tag == tag).copied();
-        move |tag| tiff.as_mut()?.number(find(tag)?)
-    };
+    let mut tiff = Tiff::new(&mut *reader);
+    let entries = tiff.as_mut().map_or(vec![], |tiff| tiff.directory(tiff.first));
+    let mut value = |tag| tiff.as_mut()?.number(*entries.iter().find(|entry| entry.tag == tag)?);
     let is_preview = value(NEW_SUBFILE_TYPE).is_some_and(|bits| bits & 1 == 1);
     let what = if is_canon || is_preview || value(DNG_VERSION).is_some() {
-        "is a raw image, which raygrad does not develop: export it as JPEG, or as TIFF of 8 or 16 bits"
+        Some("is a raw image, which raygrad does not develop: export it as JPEG, or as TIFF of 8 or 16 bits")
     } else if value(SAMPLE_FORMAT) == Some(3) {
-        FLOATS
+        Some(FLOATS)
     } else if value(EXTRA_SAMPLES) == Some(1) {
-        "is TIFF with premultiplied alpha: save it as PNG"
+        Some("is TIFF with premultiplied alpha: save it as PNG")
     } else {
-        ""
+        None
     };
-    drop(value);
     reader.rewind()?;
-    Ok((!what.is_empty()).then(|| what.to_owned()))
+    Ok(what.map(str::to_owned))
 }
 
 /// A TIFF structure. What is absent, damaged or cannot be read is left out.
@@ -105,7 +101,7 @@ impl<R: Read + Seek> Tiff<R> {
         bytes.chunks_exact(12).filter_map(entry).collect()
     }
 
-    /// The bytes of an entry's values: all that an entry of `kind` has, at most [`LONGEST`].
+    /// The bytes of an entry's values, which have this `size`, if they are of this `kind`; at most [`LONGEST`].
     fn values(&mut self, entry: Entry, kind: u16, size: usize) -> Vec<u8> {
         if entry.kind != kind {
             return vec![];

@@ -61,7 +61,7 @@ const WIDE: [&str; 4] = ["fish", "equidistant", "equirect", "spherical"];
 ///
 /// # Errors
 /// If it has one.
-pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
+pub(super) fn check_supported(object: &Object<'_>) -> Result<()> {
     fn nothing(value: &Value) -> bool {
         match value {
             Value::Array(values) => values.iter().all(nothing),
