@@ -50,8 +50,10 @@ pub fn listed(names: &[String], most: usize) -> String {
 }
 
 /// A path as a shell takes it, for commands in messages: in quotes if it has other characters than those of plain names.
+/// One that begins like a flag becomes `./-name`.
 pub fn quoted(path: &Path) -> String {
-    let path = path.display().to_string();
+    let start = if path.to_string_lossy().starts_with('-') { "./" } else { "" };
+    let path = format!("{start}{}", path.display());
     let is_plain = |c: char| c.is_alphanumeric() || "._-/:+@,".contains(c) || cfg!(windows) && c == '\\';
     match path.chars().all(is_plain) {
         true => path,
@@ -124,6 +126,18 @@ pub fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
+/// Notes that there are fewer of something than a flag asks for.
+pub fn note_fewer(flag: &str, asked: Option<usize>, there: usize, what: &str) {
+    if let Some(asked) = asked.filter(|asked| *asked > there) {
+        note(&format!("--{flag} {asked}: there are only {there} {what}"));
+    }
+}
+
+/// Returns true for a file that is not empty. Some file systems leave an empty one after a loss of power.
+pub fn is_written(file: &Path) -> bool {
+    file.metadata().is_ok_and(|about| about.is_file() && about.len() > 0)
+}
+
 /// Creates a folder with its parents and checks that it is writable.
 pub fn make_folder(folder: &Path) -> Result<()> {
     create_folder(folder)?;
@@ -183,6 +197,16 @@ pub fn depth_colors(picture: &Render, [near, far]: [f64; 2]) -> Image {
 #[cfg(all(test, unix))]
 mod tests {
     use super::*;
+
+    #[test]
+    fn quoted_paths_are_no_flags() {
+        for (path, expected) in
+            [("run", "run"), ("my run", "'my run'"), ("-run", "./-run"), ("--a b", "'./--a b'"), ("a/-b", "a/-b")]
+        {
+            // Windows has other quotation marks.
+            assert_eq!(quoted(Path::new(path)).replace('"', "'"), expected);
+        }
+    }
 
     #[test]
     fn printable_text_commands_no_terminal() {

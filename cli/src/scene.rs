@@ -28,7 +28,7 @@ pub struct CaptureArgs {
     /// Test images: none, every:N, or names
     ///
     /// Holds these images out of training, in place of the choice of the capture's files. every:8 holds out every
-    /// eighth by name, which is the default where the files have no splits. Example: --test frame_3.jpg,frame_9.jpg
+    /// eighth by name, which is the default where the capture has no splits. Example: --test frame_3.jpg,frame_9.jpg
     #[arg(long, help_heading = "Scene", value_name = "IMAGES", value_parser = parse::word::<HoldOut>)]
     pub test: Option<HoldOut>,
     /// transforms, blender, colmap or llff

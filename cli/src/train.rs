@@ -543,7 +543,8 @@ fn foresee_memory(trainer: &Trainer, data: &Dataset) -> Result<()> {
 fn describe(run: &Run, trainer: &Trainer, data: &Dataset, scene: &Opened) -> Result<()> {
     let (views, image) = (data.frames.len(), &data.frames[0].image);
     if let Some((capture, analysis)) = &scene.capture {
-        let held_out = capture.present().count() - views;
+        let splits = capture.present().filter_map(|view| view.split);
+        let held_out = splits.filter(|split| *split != Split::Train).count();
         print(&format!(
             "capture  {}, {} of {} images found, {held_out} held out; {}: {}\n",
             capture.format,

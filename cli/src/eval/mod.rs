@@ -18,7 +18,7 @@ use super::interrupt::Work;
 use super::lock::{Lock, UNFINISHED as UNFINISHED_LOCK};
 use super::machine::processor;
 use super::merge;
-use super::output::{checksum, complain, make_folder, note, numbered, other_numbered, print, remove};
+use super::output::{checksum, complain, make_folder, note, note_fewer, numbered, other_numbered, print, remove};
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
 use super::run::{Run, write_json};
@@ -132,7 +132,7 @@ fn hold_out(run: &Run, opened: &Opened) -> &'static str {
         Some(_) if run.config.test.is_some() => "as `train --test` chose",
         None => "built in",
         Some((capture, _)) if Capture::holds_out_every_eighth(capture) => "every eighth by name, from the first",
-        Some(_) => "as the capture's files say",
+        Some(_) => "as the capture says",
     }
 }
 
@@ -152,6 +152,7 @@ pub fn run(args: &Args) -> Work<()> {
     let scene = run.scene(args.scene.as_ref())?;
     let opened = run.open_scene(args.scene.as_ref())?;
     let mut data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
+    note_fewer("views", args.views, data.frames.len() + data.masked.len(), "images to compare");
     if args.split != Split::Train
         && let Some(frame) = data.frames.iter().find(|frame| run.config.images.contains(&frame.name))
     {

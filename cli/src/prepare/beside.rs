@@ -24,7 +24,8 @@ const WITHOUT: &str = "has no camera poses. Without COLMAP: scan with Polycam or
 pub fn is_unprepared(input: &Path) -> bool {
     match input.is_file() {
         true => video::is_video(input),
-        false => input.is_dir() && !Capture::is_described(input) && photographs::are_in(input),
+        false if Capture::is_described(input) => false,
+        false => photographs::are_in(input) || photographs::are_below(input),
     }
 }
 

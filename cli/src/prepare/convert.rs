@@ -17,7 +17,7 @@ use super::workplace::Workplace;
 use super::{bounds, next};
 use crate::interrupt::Work;
 use crate::merge;
-use crate::output::{complain, entries, note, print, remove};
+use crate::output::{complain, entries, is_written, note, print, remove};
 use crate::parse::read_text;
 use crate::progress::Progress;
 use crate::run::write_json;
@@ -57,7 +57,7 @@ impl Target {
 
     /// Whether the format has masks.
     fn has_masks(self) -> bool {
-        self != Target::Llff
+        !matches!(self, Target::Llff | Target::Blender)
     }
 
     /// Whether the format has measured depths.
@@ -158,7 +158,7 @@ impl Conversion {
         let inside = |path: &Path| path.strip_prefix(&folder).unwrap_or(path).to_owned();
         let list: Vec<Vec<PathBuf>> = jobs.iter().map(|job| job.files().map(inside).collect()).collect();
         write_json(&at.join(LIST), &list)?;
-        part.retain(|i| jobs[i].files().all(Path::is_file))?;
+        part.retain(|i| jobs[i].files().all(is_written))?;
         let items: Vec<usize> = part.items().skip(part.done()).collect();
         let progress = Progress::new();
         for items in items.chunks(4 * rayon::current_num_threads()) {
@@ -178,6 +178,14 @@ impl Conversion {
         if *undistort || *target == Target::Llff {
             // The format cannot hold views without images.
             capture.views.retain(|view| view.image.is_some());
+        }
+        if *target == Target::Blender && capture.views.iter().any(|view| view.split.is_some()) {
+            // The format has no place for others.
+            let count = capture.views.len();
+            capture.views.retain(|view| view.split.is_some());
+            if capture.views.len() < count {
+                note(&format!("left out {} images that are in no split", count - capture.views.len()));
+            }
         }
         if capture.present().next().is_none() && *undistort {
             return Err(Error::file(&capture.file, "none of its images exists: check their paths"));
@@ -310,6 +318,9 @@ fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
     let changed = jobs.iter().filter(|job| job.seen_by.is_some()).count();
     let copied = jobs.iter().filter(|job| job.from.image.is_some()).count() - changed;
     let absent = jobs.len() - changed - copied;
+    if absent == jobs.len() {
+        complain(&format!("warning: {}: no image exists, so only the cameras are converted", capture.file.display()));
+    }
     let mut parts = vec![format!("{} cameras", jobs.len())];
     for (count, what) in [(copied, "images copied"), (changed, "images undistorted"), (absent, "images absent")] {
         if count > 0 {
@@ -332,7 +343,7 @@ fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
     let held_out = count(|view| view.split.is_some_and(|split| split != Split::Train));
     let mut warnings = vec![];
     if masks > 0 && !target.has_masks() {
-        warnings.push(format!("{masks} masks are not converted: LLFF has none"));
+        warnings.push(format!("{masks} masks are not converted: the format has none"));
     }
     if dynamic > 0 && target == Target::Nerfstudio {
         warnings.push(format!("{dynamic} dynamic masks become a `mask_path`, which instant-ngp does not read"));
@@ -344,7 +355,7 @@ fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
     }
     if held_out > 0 && !target.has_splits() {
         warnings.push(format!(
-            "{held_out} held-out images lose their split, which the format cannot store: readers hold out others, \
+            "{held_out} held-out images lose their split, which the format cannot store: readers may hold out others, \
              such as every eighth"
         ));
     }
@@ -551,13 +562,13 @@ mod tests {
         views[0].mask = Some("mask.png".into());
         (views[1].depth, views[2].depth) = (Some(("1.npy".into(), 1.0)), Some(("2.npy".into(), 1.0)));
         let capture = Capture::new(Path::new("scene"), "scene/transforms.json".into(), Format::Transforms, views);
-        let masks = "1 masks are not converted: LLFF has none";
+        let masks = "1 masks are not converted: the format has none";
         let depths = "2 depth files are not converted: the format has none";
-        let split = "3 held-out images lose their split, which the format cannot store: readers hold out others, such \
+        let split = "3 held-out images lose their split, which the format cannot store: readers may hold out others, such \
                      as every eighth";
         for (target, expected) in [
             (Target::Nerfstudio, vec![]),
-            (Target::Blender, vec![depths]),
+            (Target::Blender, vec![masks, depths]),
             (Target::Colmap, vec![depths, split]),
             (Target::ColmapText, vec![depths, split]),
             (Target::Llff, vec![masks, depths, split]),

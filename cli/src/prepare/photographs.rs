@@ -4,14 +4,16 @@ use std::collections::HashSet;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
+use raygrad::nerf::dataset::formats::is_layer;
 use raygrad::nerf::dataset::{Photo, copy_upright};
 use raygrad::nerf::{Error, Result};
 
 use super::foreign::Foreign;
 use super::root::Root;
+use super::video::is_video;
 use super::workplace::Workplace;
 use crate::interrupt::Work;
-use crate::output::complain;
+use crate::output::{complain, entries, listed, quoted};
 use crate::progress::Progress;
 
 /// File extensions of images that raygrad reads.
@@ -129,36 +131,102 @@ impl Images {
         let what = format!("{} TIFF, BMP and EXR files are not used: other images are as many or more", alone.len());
         Images { aside: some(alone.len(), what), found: files, unread }
     }
+
+    /// The number of all images, also of those that raygrad cannot read.
+    fn count(&self) -> usize {
+        self.found.len() + self.unread
+    }
+
+    /// The error of images that raygrad cannot read.
+    fn unreadable(&self, place: &Path) -> Error {
+        let what = "images are raw or GIF, which raygrad cannot read: convert them to JPEG, PNG or TIFF";
+        Error::file(place, format!("{} {what}", self.unread))
+    }
+
+    /// Warns of images that are not used.
+    fn report(&self, place: &Path) {
+        if self.unread > 0 {
+            complain(&format!("warning: {}", self.unreadable(place)));
+        }
+        if let Some(aside) = &self.aside {
+            complain(&format!("note: {}: {aside}", place.display()));
+        }
+    }
 }
 
-/// The images of a folder or of a folder of images in it: the first of those that have most. Warns of images that raygrad
-/// cannot read, and names the other folders.
-pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
-    let unreadable = |count: usize| {
-        format!("{count} images are raw or GIF, which raygrad cannot read: convert them to JPEG, PNG or TIFF")
+/// The deepest folder below a folder that [`below`] looks at: those of cameras are such as `DCIM/100APPLE`.
+const DEEPEST: usize = 3;
+/// Folders in a message. Further ones are counted.
+const NAMED: usize = 4;
+
+/// The folders with images below one without any.
+fn below(folder: &Path, deepest: usize) -> Vec<(PathBuf, Images)> {
+    let mut inside = entries(folder).unwrap_or_default();
+    let is_other = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        name.starts_with('.') || is_layer(&name)
     };
+    inside.retain(|path| path.is_dir() && !is_other(path));
+    let of = |path: PathBuf| {
+        let further = if deepest > 1 { below(&path, deepest - 1) } else { vec![] };
+        let images = Images::of(&path);
+        [(path, images)].into_iter().filter(|(_, images)| images.count() > 0).chain(further)
+    };
+    inside.into_iter().flat_map(of).collect()
+}
+
+/// Returns true if [`find`] finds the images of a single folder below one without any.
+pub fn are_below(folder: &Path) -> bool {
+    let has_video = entries(folder).unwrap_or_default().iter().any(|path| is_video(path));
+    !has_video && matches!(&below(folder, DEEPEST)[..], [(_, images)] if !images.found.is_empty())
+}
+
+/// The images of the only folder with some below one without any.
+fn find_below(folder: &Path) -> Result<Vec<PathBuf>> {
+    let found = below(folder, DEEPEST);
+    let videos: Vec<PathBuf> = entries(folder)?.into_iter().filter(|path| is_video(path)).collect();
+    let what = match (&found[..], &videos[..]) {
+        ([(place, images)], []) if images.found.is_empty() => return Err(images.unreadable(place)),
+        ([(place, images)], []) => {
+            let (count, at) = (images.found.len(), place.display());
+            complain(&format!("note: {}: holds no images itself: used the {count} of {at}", folder.display()));
+            images.report(place);
+            return Ok(images.found.clone());
+        }
+        ([], []) => {
+            "holds no images: put .jpg, .png, .tif, .webp or .heic files in it or in its folder `images`".to_owned()
+        }
+        ([], [video]) => {
+            format!("holds no images, but a video: name that, as `raygrad prepare {}`", quoted(video))
+        }
+        _ => {
+            let folders = found.iter().map(|(place, images)| format!("{} ({})", place.display(), images.count()));
+            let all: Vec<String> = folders.chain(videos.iter().map(|video| video.display().to_string())).collect();
+            format!("holds no images itself, but others do, {}: name one of them", listed(&all, NAMED))
+        }
+    };
+    Err(Error::file(folder, what))
+}
+
+/// The images of a folder or of a folder of images in it: the first of those that have most; without any, those of the
+/// only folder below. Warns of images that raygrad cannot read, and names the other folders.
+pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
     let all: Vec<_> = places(folder).map(|place| (Images::of(&place), place)).collect();
     let best = all.iter().rev().max_by_key(|(images, _)| images.found.len());
-    let Some((Images { found, aside, unread }, place)) = best.filter(|(images, _)| !images.found.is_empty()) else {
+    let Some((images, place)) = best.filter(|(images, _)| !images.found.is_empty()) else {
         if let Some((images, place)) = all.iter().find(|(images, _)| images.unread > 0) {
-            return Err(Error::file(place, unreadable(images.unread)));
+            return Err(images.unreadable(place));
         }
-        let what = "holds no images: put .jpg, .png, .tif, .webp or .heic files in it or in its folder `images`";
-        return Err(Error::file(folder, what));
+        return find_below(folder);
     };
-    if *unread > 0 {
-        complain(&format!("warning: {}: {}", place.display(), unreadable(*unread)));
-    }
-    if let Some(aside) = aside {
-        complain(&format!("note: {}: {aside}", place.display()));
-    }
+    images.report(place);
     for (others, other) in all.iter().filter(|(others, other)| !others.found.is_empty() && other != place) {
-        let (used, left) = (found.len(), others.found.len());
+        let (used, left) = (images.found.len(), others.found.len());
         complain(&format!(
             "note: used the {used} images of {}, not the {left} of {}",
             place.display(),
             other.display()
         ));
     }
-    Ok(found.clone())
+    Ok(images.found.clone())
 }

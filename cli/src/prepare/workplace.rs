@@ -23,14 +23,13 @@ impl Workplace {
         let bad = |e: std::io::Error| Error::file(out, format!("cannot be created: {e}"));
         let is_inside = match others(out) {
             Ok(others) if !others.is_empty() => {
-                return Err(Error::file(out, "is not empty: choose another --out"));
+                return Err(Error::file(out, "is not empty: choose another folder"));
             }
             Ok(_) => true,
             Err(e) if out.is_dir() => return Err(Error::file(out, format!("cannot be read: {e}"))),
             Err(_) if out.exists() => return Err(Error::file(out, "is not a folder")),
             Err(_) if out.is_symlink() => {
-                let what =
-                    "is a symbolic link to a folder that does not exist: create that folder or choose another --out";
+                let what = "is a symbolic link to a folder that does not exist: create that folder or choose another";
                 return Err(Error::file(out, what));
             }
             Err(_) => false,

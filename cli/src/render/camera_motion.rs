@@ -11,6 +11,7 @@ use serde::{Serialize, Serializer};
 
 use super::path_file::{self, Motion};
 use crate::cameras::{Viewpoint, fitted};
+use crate::output::note_fewer;
 use crate::photographs::{Photograph, learned_transform, photographs};
 use crate::run::Run;
 use crate::scene::Scene;
@@ -68,7 +69,7 @@ pub struct CameraPathArgs {
     fov: Option<f64>,
     /// Scale of an orbit's or a spiral's radius
     ///
-    /// 1 is the usual radius.
+    /// 1 is the mean distance of the training cameras for an orbit, and LLFF's radius for a spiral.
     #[arg(long, help_heading = "Camera", value_name = "FACTOR", value_parser = parse::above_zero)]
     radius: Option<f64>,
     /// Height of an orbit, in degrees
@@ -166,6 +167,7 @@ impl CameraPathArgs {
             }
             CameraPath::Test => {
                 let all = photographs(run, model, scene, Split::Test)?;
+                note_fewer("frames", self.frames, all.len(), "test images");
                 let some = evenly_spaced(all, self.frames.unwrap_or(usize::MAX));
                 // The exact size of the downscaled image.
                 let small = |side: usize| ((side as f64 / run.config.downscale as f64).round() as usize).max(1);

@@ -217,6 +217,38 @@ fn moved_captures_render_from_their_cameras() {
 }
 
 #[test]
+fn images_in_no_split_are_not_counted() {
+    let place = Place::with_scene();
+    let train = place.transforms(Split::Train);
+    let name = |i: usize| train["frames"][i]["file_path"].clone();
+    let mut transforms = train.clone();
+    transforms["train_filenames"] = json!([name(0), name(1), name(2)]);
+    transforms["test_filenames"] = json!([name(3)]);
+    std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
+    let output = place.command(&format!("train scene/transforms.json --steps 1 --out run {SMALL}")).output().unwrap();
+    let [printed, said] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    assert!(printed.contains("6 of 6 images found, 1 held out; "), "{printed}{said}");
+    assert!(said.contains("note: 2 images are in no split, such as `train/r_4`: they are not used"), "{said}");
+}
+
+#[test]
+fn runs_keep_the_splits_of_blenders_files() {
+    let place = Place::with_scene();
+    let mut transforms = place.transforms(Split::Train);
+    for split in [Split::Val, Split::Test] {
+        let frames = place.transforms(split)["frames"].as_array().unwrap().clone();
+        transforms["frames"].as_array_mut().unwrap().extend(frames);
+    }
+    std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
+    for (scene, run) in [("scene", "run"), ("scene/transforms.json", "other")] {
+        let printed = place.succeeds(&format!("train {scene} --steps 1 --out {run} {SMALL}"));
+        assert!(printed.contains("transforms.json, 11 of 11 images found, 5 held out; "), "{printed}");
+        assert!(place.succeeds(&format!("eval {run}")).contains("mean of 3"));
+        place.succeeds(&format!("train --resume {run} --steps 2"));
+    }
+}
+
+#[test]
 fn hash_grid_resolution_follows_the_images() {
     let place = Place::with_scene();
     let small = SMALL.replace("--set field.grid.log2_table=10", "");

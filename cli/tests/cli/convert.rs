@@ -129,8 +129,9 @@ fn lenses_and_poses_survive_every_format() {
     let splits = |capture: &Capture| by_name(capture).iter().map(|(_, view)| view.split).collect::<Vec<_>>();
     assert_eq!(splits(&original), splits(&back), "the same photographs are held out");
     let output = place.command("prepare scene --to colmap-text --out again").output().unwrap();
-    let expected = "raygrad: warning: scene: 2 held-out images lose their split, which the format cannot store: \
-                    readers hold out others, such as every eighth\n";
+    let expected = "raygrad: note: 1 of 9 images have a `mask_path`; 8 have no mask, and use all pixels\n\
+                    raygrad: warning: scene: 2 held-out images lose their split, which the format cannot store: \
+                    readers may hold out others, such as every eighth\n";
     assert_eq!(String::from_utf8(output.stderr).unwrap(), expected);
     // A foreign dataset is trained on without conversion.
     place.succeeds(&format!("train back --scene-type bounded --steps 1 {CLASSIC}"));
@@ -140,15 +141,12 @@ fn lenses_and_poses_survive_every_format() {
 fn unsupported_formats_are_refused_before_writing() {
     let place = Place::empty();
     with_lens(&place);
-    place.fails("prepare scene --to blender --out made", &["has lens distortion", "--undistort"]);
-    let output = place.command("prepare scene --to llff --out made").output().unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert!(
-        output.status.code() == Some(1)
-            && said.contains("has lens distortion")
-            && said.contains("1 masks are not converted: LLFF has none"),
-        "{said}"
-    );
+    for format in ["blender", "llff"] {
+        let output = place.command(&format!("prepare scene --to {format} --out made")).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        let expected = ["has lens distortion", "--undistort", "1 masks are not converted: the format has none"];
+        assert!(output.status.code() == Some(1) && expected.iter().all(|part| said.contains(part)), "{said}");
+    }
     // Without listed masks, those of this folder would be used.
     std::fs::remove_dir_all(place.path("scene/masks")).unwrap();
     // Two images whose names would collide in one folder.
@@ -166,10 +164,46 @@ fn unsupported_formats_are_refused_before_writing() {
     place.fails("prepare scene --to colmap --out made", &["`frames[", twice]);
     transforms["frames"].as_array_mut().unwrap().pop();
     std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
-    place.fails_with("prepare scene --to colmap --out scene", "scene: is not empty: choose another --out");
+    place.fails_with("prepare scene --to colmap --out scene", "scene: is not empty: choose another folder");
     std::fs::write(place.path("scene/images/5.png"), "no picture").unwrap();
     place.fails("prepare scene --to colmap --out made", &["`frames[5]`", "5.png: cannot be decoded"]);
     assert_eq!(std::fs::read_dir(place.path("")).unwrap().count(), 1, "nothing is left");
+}
+
+#[test]
+fn cameras_without_any_image_give_a_warning() {
+    let place = Place::empty();
+    with_lens(&place);
+    std::fs::remove_dir_all(place.path("scene/images")).unwrap();
+    let output = place.command("prepare scene --to colmap --out made").output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    let warning = "warning: scene/transforms.json: no image exists, so only the cameras are converted";
+    assert!(output.status.success() && said.contains(warning), "{said}");
+    assert_eq!(read(&place, "made").views.len(), 10);
+}
+
+#[test]
+fn blender_has_no_images_without_a_split() {
+    let place = Place::empty();
+    with_lens(&place);
+    let file = place.path("scene/transforms.json");
+    let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    transforms["train_filenames"] = json!(["images/1.jpg", "images/5.png", "images/6.png"]);
+    transforms["test_filenames"] = json!(["images/7.png", "images/3.jpg"]);
+    std::fs::write(file, transforms.to_string()).unwrap();
+    let output = place.command("prepare scene --to blender --undistort --out made").output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success(), "{said}");
+    let expected = [
+        "note: 5 images are in no split, such as `images/0.jpg`: they are not used",
+        "left out 5 images that are in no split",
+        "warning: scene: 1 masks are not converted: the format has none",
+    ];
+    assert!(expected.iter().all(|part| said.contains(part)), "{said}");
+    let made: Vec<_> = read(&place, "made").views.into_iter().map(|view| (view.name, view.split)).collect();
+    let [train, test] = [Some(Split::Train), Some(Split::Test)];
+    let names = [("train/1.jpg", train), ("train/5", train), ("train/6", train), ("test/7", test)];
+    assert_eq!(made, names.map(|(name, split)| (name.to_owned(), split)));
 }
 
 #[test]

@@ -76,7 +76,7 @@ fn exported_cameras_return_as_given() {
         "scene: has no known file extension: use .json for cameras, .ply, .obj or .glb for a mesh, .html for a scene \
          page, or name a format with --to",
     );
-    place.fails_with("export run colmap --to llff", "colmap: is not empty: choose another --out");
+    place.fails_with("export run colmap --to llff", "colmap: is not empty: choose another folder");
     // Refined cameras need the training images of the run.
     std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();
     place.fails("export run other.json", &["has 5 training images", "trained on 6"]);

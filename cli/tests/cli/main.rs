@@ -216,7 +216,7 @@ impl Place {
         String::from_utf8(output.stdout).unwrap()
     }
 
-    /// Checks that a command fails with one line, which starts with the program's name and contains all of `expected`.
+    /// Checks that a command fails with one line besides notes, which starts with the program's name and contains all of `expected`.
     #[track_caller]
     fn fails(&self, arguments: &str, expected: &[&str]) {
         complained(arguments, &self.command(arguments).output().unwrap(), expected);
@@ -240,7 +240,8 @@ fn complained_of(what: &str, output: &Output, message: &str) {
 fn complained(what: &str, output: &Output, expected: &[&str]) {
     let message = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{what}: {message}");
-    let one_line = message.starts_with("raygrad: ") && message.trim_end().lines().count() == 1;
+    let mut lines = message.lines().filter(|line| !line.starts_with("raygrad: note: "));
+    let one_line = lines.next().is_some_and(|line| line.starts_with("raygrad: ")) && lines.next().is_none();
     assert!(one_line && expected.iter().all(|part| message.contains(part)), "{what}: {message}");
 }
 
@@ -294,7 +295,7 @@ fn run_is_complete_and_can_be_evaluated() {
     let picture = png(&place.path("run/eval-test/002.png"));
     assert_eq!([picture.width, picture.height], [4 * SIZE, SIZE]);
 
-    assert_eq!(printed["hold_out"], "as the capture's files say");
+    assert_eq!(printed["hold_out"], "as the capture says");
     let model = &printed["model"];
     let fields = ["steps", "seed", "images", "field", "sampler", "raygrad"].map(|field| model[field].clone());
     assert_eq!(json!(fields), json!([3, 0, 6, "classic", "hierarchical", env!("CARGO_PKG_VERSION")]));
@@ -311,7 +312,7 @@ fn run_is_complete_and_can_be_evaluated() {
     assert!(page.contains("<tr><th>model seed</th><td>0</td></tr>"), "{page}");
 
     let table = place.succeeds("eval run --split val --views 1");
-    assert!(table.contains("worst: val/r_0 (") && table.contains("val images (as the capture's files say)"), "{table}");
+    assert!(table.contains("worst: val/r_0 (") && table.contains("val images (as the capture says)"), "{table}");
     assert!(table.contains("mean of 1") && table.contains("val/r_0") && !table.contains("val/r_1"), "{table}");
     // In its own file; the other result stays.
     assert_eq!(place.json("run/eval-val-1.json")["split"], "val");

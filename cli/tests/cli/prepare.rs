@@ -120,6 +120,56 @@ fn prepare_takes_the_folder_with_most_images_and_names_unread_poses() {
     place.fails("prepare lost --out other", &["transforms.json: "]);
 }
 
+#[test]
+fn images_below_a_folder_are_found_if_one_holds_them() {
+    let place = place();
+    std::fs::create_dir_all(place.path("card/DCIM/.thumbs")).unwrap();
+    std::fs::rename(place.path("photos"), place.path("card/DCIM/100APPLE")).unwrap();
+    std::fs::write(place.path("card/DCIM/.thumbs/0.jpg"), jpeg(4, 1)).unwrap();
+    let output = run(&place, "prepare card --out made");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains("note: card: holds no images itself: used the 5 of card/DCIM/100APPLE"), "{said}");
+    assert!(place.path("made/images/4.JPG").exists());
+    // Of several folders, the user chooses one.
+    std::fs::create_dir(place.path("card/DCIM/101APPLE")).unwrap();
+    std::fs::write(place.path("card/DCIM/101APPLE/5.jpg"), jpeg(4, 1)).unwrap();
+    complained_of(
+        "two folders",
+        &run(&place, "prepare card --out other"),
+        "card: holds no images itself, but others do, card/DCIM/100APPLE (5), card/DCIM/101APPLE (1): name one of them",
+    );
+    std::fs::create_dir(place.path("films")).unwrap();
+    std::fs::rename(place.path("walk.mp4"), place.path("films/walk.mp4")).unwrap();
+    complained_of(
+        "a video",
+        &run(&place, "prepare films --out other"),
+        "films: holds no images, but a video: name that, as `raygrad prepare films/walk.mp4`",
+    );
+    std::fs::create_dir(place.path("films/previews")).unwrap();
+    std::fs::create_dir(place.path("films/covers")).unwrap();
+    for name in ["previews", "covers"] {
+        std::fs::write(place.path(&format!("films/{name}/0.jpg")), jpeg(4, 1)).unwrap();
+    }
+    complained_of(
+        "a video and an image",
+        &run(&place, "prepare films --out other"),
+        "films: holds no images itself, but others do, films/covers (1), films/walk.mp4: name one of them",
+    );
+    std::fs::create_dir_all(place.path("raw/a")).unwrap();
+    std::fs::write(place.path("raw/a/0.CR2"), "").unwrap();
+    complained_of(
+        "raw images",
+        &run(&place, "prepare raw --out other"),
+        "raw/a: 1 images are raw or GIF, which raygrad cannot read: convert them to JPEG, PNG or TIFF",
+    );
+    // Training prepares them too.
+    std::fs::remove_dir_all(place.path("card/DCIM/101APPLE")).unwrap();
+    let output = run(&place, &format!("train card --scene-type bounded --steps 1 {CLASSIC}"));
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(place.path("card-prepared/images/4.JPG").exists());
+}
+
 /// A JPEG of 16 x 8 pixels with stripes and an EXIF orientation.
 fn jpeg(period: usize, orientation: u8) -> Vec<u8> {
     let mut exif = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
@@ -405,7 +455,7 @@ fn video_becomes_a_dataset_of_sharp_frames() {
     complained("a folder", &run(&place, "prepare photos --out other --frames 9"), &["`frames`: is for videos"]);
     // It is a dataset, and no second one overwrites it.
     place.succeeds(&format!("train made --scene-type bounded --steps 1 {CLASSIC}"));
-    complained("again", &run(&place, "prepare walk.mp4 --out made"), &["made: is not empty", "--out"]);
+    complained("again", &run(&place, "prepare walk.mp4 --out made"), &["made: is not empty: choose another folder"]);
 }
 
 #[test]

@@ -347,8 +347,8 @@ impl Photo {
         self
     }
 
-    /// Converts a mask to grey values whose brightest is white. Transparent pixels become black. A mask may have one value
-    /// besides black, such as the number or the colour of an object.
+    /// Converts a mask to grey values whose brightest is white. Transparent pixels become black. A mask may have one value,
+    /// besides black or alone, such as the number or the colour of an object.
     ///
     /// `None` if it has several values or colours, and no white: programs that number objects write 1, 2, 3.
     pub(super) fn into_mask(mut self) -> Option<Photo> {
@@ -358,7 +358,7 @@ impl Photo {
         let most = all().map(brightness).fold(0.0, f32::max);
         let first = all().find(|color| brightness(*color) > 0.0);
         let is_black = |color: [f32; 3]| brightness(color) == 0.0;
-        let is_single = all().any(is_black) && all().all(|color| is_black(color) || Some(color) == first);
+        let is_single = all().all(|color| is_black(color) || Some(color) == first);
         let is_grey = |color: [f32; 3]| color.into_iter().all(|value| brightness(color) - value <= GREY);
         if !is_single && (most < LEAST_WHITE || !all().all(is_grey)) {
             return None;

@@ -11,6 +11,16 @@ use std::path::{Path, PathBuf};
 /// Without splits in the files, every this many images by name, from the first, is held out.
 const HELD_OUT: usize = 8;
 
+/// The split that the innermost of a path's folders with the name of one has.
+fn split_of_folders(path: &Path) -> Option<Split> {
+    path.ancestors().skip(1).find_map(|folder| match folder.file_name()?.to_str()?.to_lowercase().as_str() {
+        "train" => Some(Split::Train),
+        "val" | "eval" => Some(Split::Val),
+        "test" => Some(Split::Test),
+        _ => None,
+    })
+}
+
 impl Capture {
     /// Reads the cameras of a folder in any [format](super::formats), without decoding images.
     ///
@@ -18,9 +28,11 @@ impl Capture {
     /// model. If a folder holds several descriptions, the one with most existing images counts; of equally many, the
     /// first of `transforms.json`, Blender, COLMAP and LLFF. [`assumptions`](Self::assumptions) states the choice.
     ///
-    /// Without splits in the files, every eighth image by name, from the first, is a [test](Split::Test) image, even if
-    /// its file does not exist. The others are training images. If the files list only training images, the others are
-    /// test images; if they list only held-out images, the others are training images.
+    /// Without splits in the files, folders such as `train` and `test` are splits if all images are in some. Without
+    /// these, every eighth image by name, from the first, is a [test](Split::Test) image, even if its file does not
+    /// exist. The others are training images. If the files list only training images, the others are test images; if
+    /// they list only held-out images, the others are training images. If they list both, others are
+    /// [not used](Self::assumptions).
     ///
     /// # Errors
     /// If the path is absent or has no known format, a file has a bad field, or an image is in both the training and
@@ -65,9 +77,41 @@ impl Capture {
     }
 
     fn with_default_splits(mut self) -> Result<Capture> {
+        self.split_by_folders();
         self.split_by_default();
         self.check_splits()?;
+        let unused: Vec<&View> = self.present().filter(|view| view.split.is_none()).collect();
+        if let [first, ..] = unused[..] {
+            let count = unused.len();
+            let what = format!("{count} images are in no split, such as `{}`: they are not used", first.name);
+            self.assumptions.push(what);
+        }
         Ok(self)
+    }
+
+    /// Sets the splits of images in folders such as `train` and `test`, if the files give none. All existing ones must be
+    /// in such folders, of training images and of held-out ones.
+    fn split_by_folders(&mut self) {
+        if self.views.iter().any(|view| view.split.is_some()) {
+            return;
+        }
+        let present = self.present().map(|view| (view, split_of_folders(self.inside(view))));
+        let (trained, others): (Vec<_>, Vec<_>) = present.partition(|(_, split)| *split == Some(Split::Train));
+        let Some((first, _)) = others.first().filter(|_| !trained.is_empty()) else { return };
+        if others.iter().any(|(_, split)| split.is_none()) {
+            return;
+        }
+        let (count, first) = (others.len(), self.inside(first).display());
+        let what = format!("folders of the images are splits, such as that of `{first}`: {count} are held out");
+        let splits: Vec<_> = self.views.iter().map(|view| split_of_folders(self.inside(view))).collect();
+        self.views.iter_mut().zip(splits).for_each(|(view, split)| view.split = split);
+        self.assumptions.push(what);
+    }
+
+    /// The path of a view's image below the capture's folder, or its name.
+    fn inside<'a>(&self, view: &'a View) -> &'a Path {
+        let inside = view.image.as_deref().and_then(|image| image.strip_prefix(&self.folder).ok());
+        inside.unwrap_or(Path::new(&view.name))
     }
 
     /// Returns true if a folder or its parent describes a capture, if the folder holds one below, or if it is an export of

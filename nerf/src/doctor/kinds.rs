@@ -58,9 +58,9 @@ kinds! {
     ImagesAbsent = "images-absent", Warning,
         "missing files: {} of {} listed",
         "Training skips them. If they should exist, correct the paths and file extensions in the capture.";
-    /// Images or masks cannot be decoded.
+    /// Images cannot be decoded.
     ImagesUndecodable = "images-undecodable", Error,
-        "cannot decode {} (image or mask); the first: {}",
+        "cannot decode {}; the first: {}",
         "Copy these files again, or remove them from the capture. raygrad reads PNG, JPEG, WebP, TIFF and BMP.";
     /// Training refuses the capture, for a reason that no other finding states.
     Refused = "refused", Error,
@@ -217,6 +217,10 @@ kinds! {
     MaskShape = "mask-shape", Error,
         "the aspect ratio of the mask does not match that of {}: {}",
         "A mask may have any size, but it must show the whole image. Make these masks again.";
+    /// Masks cannot be decoded, or do not say which pixels are used.
+    MaskUnusable = "mask-unusable", Error,
+        "cannot use the mask of {}; the first: {}",
+        "Copy damaged masks again. Others must be black where pixels are not used, and white elsewhere.";
     /// Masks hide whole images.
     MaskHidesAll = "mask-hides-all", Warning,
         "the masks of {} hide every pixel",

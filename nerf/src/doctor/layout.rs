@@ -91,7 +91,8 @@ fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
     };
     // A panorama shows as much as the six sides of a cube.
     let shown: usize = views.iter().map(|view| if is_panorama(&view.camera) { 6 } else { 1 }).sum();
-    if shown < FEW[1] {
+    // Where the files list enough, those that do not exist are the fault.
+    if shown < FEW[1] && capture.views.len() < FEW[1] {
         let finding = findings.add(Kind::FewImages, &[&what]);
         if shown < FEW[0] {
             finding.severity = Error;
@@ -259,4 +260,39 @@ fn in_the_box(views: &[&View], analysis: &SceneAnalysis, findings: &mut Findings
     };
     findings.about(Kind::CameraInBox, views.iter().filter(inside).copied(), &[]);
     findings.about(Kind::MissesBox, views.iter().filter(misses).copied(), &[]);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn few_images_are_found_unless_others_are_absent() {
+        let severity = |listed: usize, present: usize, lens: Lens| {
+            let camera = Camera { lens, ..Camera::from_angle(8, 6, 0.7, DAffine3::IDENTITY) };
+            let view = |i: usize| {
+                let image = (i < present).then(|| "0.png".into());
+                View { image, split: Some(Split::Test), ..View::new(i.to_string(), "", camera.clone()) }
+            };
+            let views = (0..listed).map(view).collect();
+            let capture = Capture::new("scene".as_ref(), "transforms.json".into(), Format::Transforms, views);
+            let mut findings = Findings::default();
+            few(&capture, &capture.present().collect::<Vec<_>>(), &mut findings);
+            let found = findings.sorted(None);
+            assert!(found.iter().all(|finding| finding.kind == Kind::FewImages), "{found:?}");
+            found.first().map(|finding| finding.severity)
+        };
+        for (listed, present, expected) in [
+            (4, 4, Some(Error)),
+            (5, 5, Some(Warning)),
+            (19, 19, Some(Warning)),
+            (19, 3, Some(Error)),
+            (20, 20, None),
+            (20, 0, None),
+            (40, 3, None),
+        ] {
+            assert_eq!(severity(listed, present, Lens::Pinhole), expected, "{present} of {listed}");
+        }
+        assert_eq!(severity(4, 4, Lens::Equirectangular), None, "they show as much as 24");
+    }
 }

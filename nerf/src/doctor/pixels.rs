@@ -6,7 +6,7 @@ use super::report::Findings;
 use crate::dataset::image_size::used_size;
 use crate::dataset::load::mask_fits;
 use crate::dataset::{Capture, EmptyBackground, Photo, SceneAnalysis, SceneType, Split, View};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::numbers::{median, spread};
 use glam::DVec3;
 use std::collections::{HashMap, HashSet};
@@ -89,11 +89,16 @@ pub(super) fn without_alpha(capture: &Capture, analysis: Option<&SceneAnalysis>,
     }
 }
 
-/// Adds a finding about images that cannot be decoded.
+/// Adds findings about images that cannot be decoded, and about their masks.
 pub(super) fn unreadable(looks: &[(&View, Result<Look>)], findings: &mut Findings) {
-    let errors: Vec<_> = looks.iter().filter_map(|(view, look)| Some((*view, look.as_ref().err()?))).collect();
-    if let Some((_, first)) = errors.first() {
-        findings.about(Kind::ImagesUndecodable, errors.iter().map(|(view, _)| *view), &[first]);
+    let errors = looks.iter().filter_map(|(view, look)| Some((*view, look.as_ref().err()?)));
+    let is_of_mask =
+        |(view, error): &(&View, &Error)| matches!(error, Error::File { path, .. } if view.mask.as_ref() == Some(path));
+    let (masks, images): (Vec<_>, Vec<_>) = errors.partition(is_of_mask);
+    for (kind, errors) in [(Kind::ImagesUndecodable, images), (Kind::MaskUnusable, masks)] {
+        if let Some((_, first)) = errors.first() {
+            findings.about(kind, errors.iter().map(|(view, _)| *view), &[first]);
+        }
     }
 }
 
@@ -236,6 +241,40 @@ mod tests {
     use image::{ExtendedColorType, ImageEncoder};
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64Mcg;
+
+    #[test]
+    fn unusable_masks_are_no_fault_of_images() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, contents: &[u8]| {
+            let path = folder.path().join(name);
+            std::fs::write(&path, contents).unwrap();
+            Some(path)
+        };
+        let camera = Camera::from_angle(8, 6, 0.7, DAffine3::IDENTITY);
+        let mut numbers = Image::new(8, 6, 1);
+        (0..3).for_each(|i| numbers.data[i] = 0.1 * i as f32);
+        let [good, numbers, damaged] = [Image::new(8, 6, 3).to_png(), numbers.to_png(), vec![1, 2]];
+        let view = |i: usize| {
+            let (image, mask) = [(&good, &good), (&good, &numbers), (&good, &damaged), (&damaged, &good)][i];
+            let [image, mask] = [write(&format!("{i}.png"), image), write(&format!("mask{i}.png"), mask)];
+            View { image, mask, ..View::new(i.to_string(), i.to_string(), camera.clone()) }
+        };
+        let views = (0..4).map(view).collect();
+        let capture = Capture::new(folder.path(), "transforms.json".into(), Format::Transforms, views);
+        let looks = look_at_all(&capture, &|_, _| {});
+        let mut findings = Findings::default();
+        unreadable(&looks, &mut findings);
+        let found = findings.sorted(None);
+        let found: Vec<_> =
+            found.iter().map(|finding| (finding.kind, finding.views.join(" "), &finding.what)).collect();
+        let [images, masks] = &found[..] else { panic!("{found:?}") };
+        assert_eq!((images.0, images.1.as_str()), (Kind::ImagesUndecodable, "3"));
+        assert_eq!((masks.0, masks.1.as_str()), (Kind::MaskUnusable, "1 2"));
+        assert!(
+            masks.2.contains("of 2 images; the first: ") && masks.2.contains("mask1.png: has no white"),
+            "{masks:?}"
+        );
+    }
 
     #[test]
     fn masks_of_another_shape_are_found() {

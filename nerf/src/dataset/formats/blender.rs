@@ -6,7 +6,7 @@
 
 use super::frames::{Dialect, Frames};
 use super::json::{self, Object, unused};
-use super::{matrix, paths};
+use super::{masks, matrix, paths};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
@@ -41,14 +41,14 @@ pub(super) fn file(folder: &Path) -> Option<PathBuf> {
 /// # Errors
 /// If there is no file, or one cannot be read, lacks a field, or has a field that is wrong or unsupported.
 pub fn read(folder: &Path) -> Result<Capture> {
-    read_files(folder, true)
+    read_files(folder, folder, true)
 }
 
-/// [`read`], without files of held-out images that are no JSON, unless they are `needed`.
-pub(super) fn read_files(folder: &Path, needed: bool) -> Result<Capture> {
+/// [`read`] for files in the folder `place`, without those of held-out images that are no JSON, unless they are `needed`.
+pub(super) fn read_files(place: &Path, folder: &Path, needed: bool) -> Result<Capture> {
     let (mut documents, mut notes) = (vec![], vec![]);
     for split in Split::ALL {
-        let file = file_of(folder, split);
+        let file = file_of(place, split);
         if !file.is_file() {
             continue;
         }
@@ -65,7 +65,7 @@ pub(super) fn read_files(folder: &Path, needed: bool) -> Result<Capture> {
     let Some((_, _, first)) = documents.first() else {
         let what = "is not a Blender dataset: expected transforms_train.json, transforms_val.json or \
                     transforms_test.json";
-        return Err(Error::file(folder, what));
+        return Err(Error::file(place, what));
     };
     let tops = documents.iter().map(|(_, document, file)| Object::top(file, document)).collect::<Result<Vec<_>>>()?;
     let Frames { mut views, mut assumptions, .. } = Frames::read(&tops, folder, Dialect::Blender)?;
@@ -79,7 +79,10 @@ pub(super) fn read_files(folder: &Path, needed: bool) -> Result<Capture> {
         aabb_scale = aabb_scale.or(unused(tops[i].positive("aabb_scale"), &mut assumptions));
     }
     let views = views.into_iter().flatten().collect();
-    Ok(Capture { aabb_scale, assumptions, ..Capture::new(folder, first.clone(), Format::Blender, views) })
+    let capture = Capture::new(folder, first.clone(), Format::Blender, views);
+    let mut capture = Capture { aabb_scale, assumptions, ..capture };
+    masks::attach_unlisted(&mut capture)?;
+    Ok(capture)
 }
 
 /// Writes a file for each split that has views, or `transforms_train.json` if no view has a split.

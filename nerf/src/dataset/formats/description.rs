@@ -1,12 +1,14 @@
 //! Which files of a folder describe a capture.
 
 use super::exports::{self, is_archive};
-use super::locate::{shown, walk};
-use super::{blender, colmap, llff, transforms};
+use super::locate::{IMAGES, factor_in, shown, walk};
+use super::paths::folded;
+use super::{blender, colmap, llff, paths, transforms};
 use crate::camera::lens::Lens;
 use crate::dataset::capture::{Capture, Format, View};
 use crate::dataset::frames::Split;
 use crate::error::{Error, Result};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The deepest folders that are searched for a description in an unusual place: the first, and if these hold none.
@@ -52,12 +54,39 @@ impl Description {
     /// Reads the capture; splits of its files must be right only if they are `needed`.
     fn read(&self, needed: bool) -> Result<Capture> {
         let Description { format, folder, file } = self;
-        match format {
-            Format::Blender => blender::read_files(folder, needed),
-            Format::Transforms => transforms::read_file(folder, file, needed),
-            Format::Colmap => colmap::read_model(folder, file, needed),
-            Format::Llff => llff::read(folder),
+        let mut capture = match format {
+            Format::Blender => return blender::read_files(folder, folder, needed),
+            Format::Transforms => transforms::read_file(folder, file, needed)?,
+            Format::Colmap => colmap::read_model(folder, file, needed)?,
+            Format::Llff => llff::read(folder)?,
+        };
+        if needed && capture.views.iter().all(|view| view.split.is_none()) {
+            self.split_as_blender(&mut capture);
         }
+        Ok(capture)
+    }
+
+    /// Sets the splits of a capture without any to those that Blender's files beside it give the same images.
+    fn split_as_blender(&self, capture: &mut Capture) {
+        let beside = self.file.parent().filter(|_| self.format == Format::Transforms).unwrap_or(&self.folder);
+        let Some(file) = blender::file(beside) else { return };
+        let name = below(beside, &file);
+        let known = match blender::read_files(beside, &self.folder, true) {
+            Ok(capture) => capture,
+            Err(error) => {
+                capture.assumptions.push(format!("the splits of `{name}` and the files like it are not used: {error}"));
+                return;
+            }
+        };
+        let known = splits(&known);
+        let of = |view: &View| known.get(view.image.as_deref()?).copied().flatten();
+        let present: Vec<Option<Split>> = capture.present().map(of).collect();
+        // Where all images are of one, it says nothing.
+        if present.iter().all(|split| *split == present[0]) {
+            return;
+        }
+        capture.views.iter_mut().for_each(|view| view.split = of(view));
+        capture.assumptions.push(format!("the splits are those of `{name}` and the files like it"));
     }
 
     /// The path below the capture's folder, of a COLMAP model without its file unless that has a twin in the other
@@ -195,9 +224,7 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
             );
             return Err(Error::file(path, what));
         }
-        let is_alone = description.format == Format::Transforms;
-        let around = description.folder.parent().filter(|_| is_alone).unwrap_or(&description.folder);
-        return with_images_around(around, capture, needed);
+        return with_images_beside(capture, needed);
     }
     let mut all = descriptions(path);
     let is_usual = !all.is_empty();
@@ -210,7 +237,9 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
     }
     if is_usual {
         let capture = most_complete(&all, needed)?;
-        let Some(mut inner) = undistorted_within(&capture, needed)? else { return Ok(capture) };
+        let Some(mut inner) = undistorted_within(&capture, needed)? else {
+            return with_images_beside(capture, needed);
+        };
         let [own, other] = [&capture, &inner].map(|capture| below(path, &capture.file));
         let what = format!("`{own}` has a lens, and its images were undistorted for `{other}`: used this");
         inner.assumptions.insert(0, what);
@@ -219,26 +248,39 @@ pub(in crate::dataset) fn read(path: &Path, asked: Option<Format>, needed: bool)
     check_single(path, &all)?;
     let capture = most_complete(&all, needed)?;
     let model = below(path, &capture.file);
-    let mut capture = with_images_around(path, capture, needed)?;
+    let roots = capture.folder.ancestors().skip(1).take_while(|root| root.starts_with(path));
+    let roots: Vec<PathBuf> = roots.map(Path::to_owned).collect();
+    let mut capture = with_images_around(&roots, capture, needed)?;
     capture.assumptions.insert(0, format!("the usual places hold no capture: used `{model}`"));
     Ok(capture)
 }
 
-/// The capture with images in the folders around its own, up to `top`, if it has no images itself.
+/// The capture of a transforms.json with images in the folder around its own, if it has no images itself.
+///
+/// # Errors
+/// As the format's own `read`.
+fn with_images_beside(capture: Capture, needed: bool) -> Result<Capture> {
+    let around = above(&capture.folder).filter(|_| capture.format == Format::Transforms);
+    with_images_around(around.as_slice(), capture, needed)
+}
+
+/// The capture with images in one of the folders around its own, if it has no images itself.
 ///
 /// # Errors
 /// If it is a COLMAP model that may have images of its own, or as the format's own `read`.
-fn with_images_around(top: &Path, capture: Capture, needed: bool) -> Result<Capture> {
+fn with_images_around(roots: &[PathBuf], capture: Capture, needed: bool) -> Result<Capture> {
     let may_be = matches!(capture.format, Format::Colmap | Format::Transforms);
-    if !may_be || capture.present().next().is_some() {
-        return Ok(capture);
-    }
-    let roots = capture.folder.ancestors().skip(1).take_while(|root| root.starts_with(top));
-    for root in roots.map(Path::to_owned).collect::<Vec<_>>() {
-        let around = Description::new(capture.format, &root, capture.file.clone()).read(needed)?;
+    let Some(top) = roots.last().filter(|_| may_be && capture.present().next().is_none()) else { return Ok(capture) };
+    for root in roots {
+        // Other folders may hold images of the same names.
+        let is_near = |view: &View| near(root, &view.name);
+        if capture.format == Format::Transforms && !capture.views.iter().any(is_near) {
+            continue;
+        }
+        let mut around = Description::new(capture.format, root, capture.file.clone()).read(needed)?;
         // Images farther below may be those of other captures.
         let is_near = |view: &View| {
-            let inside = view.image.as_ref().and_then(|image| image.strip_prefix(&root).ok());
+            let inside = view.image.as_ref().and_then(|image| image.strip_prefix(root).ok());
             inside.is_some_and(|inside| inside.components().count() <= 2 || inside == Path::new(&view.name))
         };
         let is_own = capture.format == Format::Colmap || around.present().all(is_near);
@@ -254,12 +296,26 @@ fn with_images_around(top: &Path, capture: Capture, needed: bool) -> Result<Capt
             );
             return Err(Error::file(&capture.file, what));
         }
-        let mut around = around;
         let file = below(top, &capture.file);
         around.assumptions.push(format!("no images are beside `{file}`: used others, such as `{image}`"));
         return Ok(around);
     }
     Ok(capture)
+}
+
+/// Returns true if an image is at its listed path below a folder, in that folder itself, or in one in it with the name of
+/// the listed folder or of a folder of images. If only its name is listed, any folder that is no capture counts.
+fn near(root: &Path, name: &str) -> bool {
+    let (place, last) = name.rsplit_once('/').unwrap_or(("", name));
+    let listed = place.rsplit('/').next().map(folded).unwrap_or_default();
+    let is_named = |folder: &PathBuf| {
+        let own = folder.file_name().map(|name| folded(&name.to_string_lossy())).unwrap_or_default();
+        let is_listed = if listed.is_empty() { descriptions(folder).is_empty() } else { own == listed };
+        is_listed || IMAGES.contains(&&*own) || factor_in(&own, "images").is_some()
+    };
+    let folders = std::fs::read_dir(root).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut places = [root.to_owned()].into_iter().chain(folders.filter(is_named));
+    paths::find(root, name).is_some() || places.any(|place| paths::find(&place, last).is_some())
 }
 
 /// The capture of pinhole cameras in a folder of a COLMAP model with a lens, if the images that were found for the model
@@ -307,7 +363,11 @@ fn most_complete(all: &[Description], needed: bool) -> Result<Capture> {
     };
     let others: Vec<_> = captures.iter().enumerate().filter(|(i, _)| *i != best).collect();
     // The usual case: one description was made from the other.
-    let is_usual = best == 0 && others.iter().all(|(_, (_, capture))| present(capture) == most);
+    let is_twin = |(other, capture): &(&Description, Result<Capture>)| match (capture, &captures[best].1) {
+        (Ok(own), Ok(first)) if other.format == Format::Blender => splits(own).keys().eq(splits(first).keys()),
+        _ => present(capture) == most,
+    };
+    let is_usual = best == 0 && others.iter().all(|(_, other)| is_twin(other));
     let used = count(&captures[best]);
     let others: Vec<String> = others.into_iter().map(|(_, other)| count(other)).collect();
     let mut capture = captures.swap_remove(best).1?;
@@ -316,6 +376,11 @@ fn most_complete(all: &[Description], needed: bool) -> Result<Capture> {
         capture.assumptions.insert(0, what);
     }
     Ok(capture)
+}
+
+/// The files of a capture's images, with their splits.
+fn splits(capture: &Capture) -> BTreeMap<&Path, Option<Split>> {
+    capture.present().filter_map(|view| Some((view.image.as_deref()?, view.split))).collect()
 }
 
 /// Returns true if a folder or its parent has a description, or if the folder is an export of another program or holds

@@ -34,6 +34,12 @@ const LAYERS: [&str; 12] = [
 ];
 /// Further ones, which may be parts of other words.
 const LAYER_WORDS: [&str; 6] = ["seg", "flow", "edge", "edges", "matte", "mattes"];
+/// Returns true for the name of a folder with other files than images, such as masks or depths.
+pub fn is_layer(name: &str) -> bool {
+    let name = folded(name);
+    LAYERS.iter().any(|layer| name.contains(layer)) || words(&name).any(|word| LAYER_WORDS.contains(&word))
+}
+
 /// The last parts of a listed path that state its kind; those before are the user's.
 const STATED: usize = 2;
 
@@ -301,7 +307,8 @@ impl Tree {
     /// The folders for the names of the listed folder `place`, whose paths have the longest common end with it; several
     /// if they are equally long. Without a common part, a folder must hold most names.
     ///
-    /// A folder `images_4` counts as `images`, after folders of full size; the least downscaled counts.
+    /// A folder `images_4` counts as `images`, after folders of full size; the least downscaled counts. If no folder fits,
+    /// those of several splits together count as the folder around them.
     fn best(&self, place: &str, names: &[&str]) -> Vec<&Directory> {
         let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
         for name in names {
@@ -309,20 +316,37 @@ impl Tree {
                 *counts.entry(*holder).or_default() += 1;
             }
         }
-        let wanted = wanted(place);
-        let rate = |directory: &Directory, count: usize| {
-            let own = parts(&directory.inside);
-            let path = self.root.iter().chain(&own);
-            let common = path.rev().zip(wanted.iter().rev()).take_while(|(a, b)| a == b).count();
-            (is_of_kind(&own, &wanted) && (common > 0 || 2 * count > names.len()))
-                .then_some((common, Reverse(factor_of(&directory.inside))))
+        let (wanted, all) = (wanted(place), counts.values().sum());
+        let is_split = |part: &String| SPLITS.contains(&part.as_str());
+        let around = |directory: &Directory| {
+            let mut own = parts(&directory.inside);
+            own.retain(|part| !is_split(part));
+            own
         };
-        let rated: Vec<_> = counts
-            .into_iter()
-            .filter_map(|(i, count)| Some((rate(&self.directories[i], count)?, &self.directories[i])))
-            .collect();
-        let most = rated.iter().map(|(rating, _)| *rating).max();
-        rated.into_iter().filter(|(rating, _)| Some(*rating) == most).map(|(_, directory)| directory).collect()
+        // The folders with the highest rating: by their own path, or by the one around their split.
+        let highest = |by_split: bool| {
+            let rate = |directory: &Directory, count: usize| {
+                let own = if by_split { around(directory) } else { parts(&directory.inside) };
+                let path = self.root.iter().chain(&own);
+                let common = path.rev().zip(wanted.iter().rev()).take_while(|(a, b)| a == b).count();
+                (is_of_kind(&own, &wanted) && (common > 0 || 2 * count > names.len()))
+                    .then_some((common, Reverse(factor_of(&directory.inside))))
+            };
+            let holders = counts.iter().map(|(i, count)| (&self.directories[*i], if by_split { all } else { *count }));
+            let rated: Vec<_> = holders.filter_map(|(holder, count)| Some((rate(holder, count)?, holder))).collect();
+            let most = rated.iter().map(|(rating, _)| *rating).max();
+            rated.into_iter().filter(|(rating, _)| Some(*rating) == most).map(|(_, holder)| holder).collect::<Vec<_>>()
+        };
+        let found = highest(false);
+        if !found.is_empty() || wanted.iter().any(is_split) {
+            return found;
+        }
+        let found = highest(true);
+        let splits: HashSet<Option<String>> =
+            found.iter().map(|directory| parts(&directory.inside).into_iter().find(is_split)).collect();
+        // A single split may be another one than that of the names, and several captures may have some.
+        let is_whole = splits.len() > 1 && found.iter().all(|directory| around(directory) == around(found[0]));
+        if is_whole { found } else { vec![] }
     }
 }
 
@@ -408,8 +432,17 @@ const LARGEST_FACTOR: usize = 32;
 
 /// The factor of a path in a folder of downscaled images, such as `images_4`; 1 for other paths.
 pub(in crate::dataset) fn factor_of(inside: &Path) -> usize {
-    let factor = |part: Component<'_>| part.as_os_str().to_str()?.strip_prefix("images_")?.parse().ok();
-    inside.components().find_map(factor).filter(|factor| (1..=LARGEST_FACTOR).contains(factor)).unwrap_or(1)
+    let factor = |part: Component<'_>| factor_in(part.as_os_str().to_str()?, "images").filter(|factor| *factor > 1);
+    inside.components().find_map(factor).unwrap_or(1)
+}
+
+/// The factor in a folder's name: 4 of `images_4`, and 1 of `images` itself; `None` for other names.
+pub(super) fn factor_in(name: &str, base: &str) -> Option<usize> {
+    let rest = name.strip_prefix(base)?;
+    if rest.is_empty() {
+        return Some(1);
+    }
+    rest.strip_prefix('_')?.parse().ok().filter(|factor| (2..=LARGEST_FACTOR).contains(factor))
 }
 
 #[cfg(test)]

@@ -1,28 +1,49 @@
 //! Masks in a folder beside the images, and dynamic masks among them.
 
-use super::locate::{IMAGES, folders, stem};
+use super::locate::{IMAGES, factor_in, stem};
 use super::paths::{extension, folded};
 use crate::dataset::capture::{Capture, View};
 use crate::error::{Error, Result};
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-/// Names of mask folders, in any case.
+/// Names of mask folders, in any case; downscaled masks have their factor after it, as `masks_4`.
 const FOLDERS: [&str; 2] = ["masks", "mask"];
 
-/// Sets the masks of views that have one in a mask folder of `roots`. An assumption says if only some have one.
+/// The mask folders of a capture. Of each name, larger masks come first.
+fn folders(root: &Path) -> Vec<PathBuf> {
+    let rated = |path: PathBuf| {
+        let name = path.file_name()?.to_str()?;
+        let lower = name.to_lowercase();
+        let place = |base: &&str| Some((factor_in(&lower, base)?, FOLDERS.iter().position(|other| other == base)?));
+        let (factor, place) = FOLDERS.iter().find_map(place)?;
+        path.is_dir().then(|| (factor, place, name != lower, path.clone()))
+    };
+    let entries = std::fs::read_dir(root).into_iter().flatten().flatten();
+    let mut found: Vec<_> = entries.filter_map(|entry| rated(entry.path())).collect();
+    found.sort();
+    found.into_iter().map(|(.., path)| path).collect()
+}
+
+/// Sets the masks of views without one that have one in a mask folder of `roots`. An assumption says if only some have
+/// one.
 ///
 /// # Errors
 /// If a mask fits two images.
 pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) -> Result<()> {
-    let folders: Vec<PathBuf> = roots.iter().flat_map(|root| folders(root, &FOLDERS)).collect();
+    let folders: Vec<PathBuf> = roots.iter().flat_map(|root| folders(root)).collect();
     let Some(name) = folders.first().and_then(|folder| folder.file_name()).map(Path::new) else {
         return Ok(());
     };
-    let mut listings = HashMap::new();
-    for view in &mut capture.views {
-        // COLMAP's own naming comes first.
-        let names = [Path::new(&view.name)].into_iter().chain(inner(&view.name)).flat_map(|own| {
+    let (mut listings, mut counts) = (HashMap::new(), HashMap::new());
+    for view in &capture.views {
+        *counts.entry(plain(&view.name).to_owned()).or_insert(0) += 1;
+    }
+    for view in capture.views.iter_mut().filter(|view| view.mask.is_none()) {
+        // COLMAP's own naming comes first. A name without folders must be that of a single image.
+        let last = Some(plain(&view.name)).filter(|last| counts[*last] == 1);
+        let own = [Path::new(&view.name)].into_iter().chain(inner(&view.name)).chain(last);
+        let names = own.flat_map(|own| {
             let whole = PathBuf::from(format!("{}.png", own.display()));
             let others = ["jpg", "jpeg", "webp"].map(|ending| own.with_extension(ending));
             [whole, own.with_extension("png"), own.to_owned()].into_iter().chain(others)
@@ -35,7 +56,7 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) -> Result<()> {
     let mut owners: HashMap<PathBuf, usize> = HashMap::new();
     for i in 0..capture.views.len() {
         let view = &capture.views[i];
-        let Some(mask) = view.mask.clone().filter(|_| view.image.is_some()) else { continue };
+        let Some(mask) = view.mask.clone().filter(|_| view.image.is_some() && is_masked(&view)) else { continue };
         let first = *owners.entry(mask.clone()).or_insert(i);
         if capture.views[first].image == view.image {
             continue;
@@ -56,27 +77,44 @@ pub(super) fn attach(capture: &mut Capture, roots: &[PathBuf]) -> Result<()> {
             }
         }
     }
-    let present = capture.present().count();
-    let masked = capture.present().filter(|view| view.mask.is_some()).count();
-    if masked < present {
-        let name = name.display();
-        let what = format!("{masked} of {present} images have a mask in `{name}`; the others use all pixels");
-        capture.assumptions.push(what);
-    }
+    // Names with a number may also be those of objects.
+    let name_of = |folder: &PathBuf| folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let is_used = |folder: &&PathBuf| {
+        capture.present().filter_map(|view| view.mask.as_ref()).any(|mask| mask.starts_with(folder))
+    };
+    let numbered = folders.iter().filter(is_used).map(name_of).find(|name| name.contains('_'));
+    capture.assumptions.extend(numbered.map(|name| format!("there are no larger masks: used those in `{name}`")));
+    note_unmasked(capture, &format!("a mask in `{}`", name.display()));
     Ok(())
 }
 
-/// [`attach`] for a file whose frames list no masks.
+/// Returns true for a view with a mask that is white where pixels are used.
+fn is_masked(view: &&View) -> bool {
+    view.mask.is_some() && !view.mask_is_dynamic
+}
+
+/// Adds an assumption if only some images have such masks.
+fn note_unmasked(capture: &mut Capture, masks: &str) {
+    let [present, masked] = [capture.present().count(), capture.present().filter(is_masked).count()];
+    let unmasked = capture.present().filter(|view| view.mask.is_none()).count();
+    if masked < present {
+        let rest = if unmasked > 0 { format!("; {unmasked} have no mask, and use all pixels") } else { String::new() };
+        capture.assumptions.push(format!("{masked} of {present} images have {masks}{rest}"));
+    }
+}
+
+/// [`attach`] for files whose frames may list masks. If any does, no others are used.
 ///
 /// # Errors
 /// If a mask fits two images.
 pub(super) fn attach_unlisted(capture: &mut Capture) -> Result<()> {
-    if capture.views.iter().any(|view| view.mask.is_some()) {
+    if capture.views.iter().any(|view| is_masked(&view)) {
+        note_unmasked(capture, "a `mask_path`");
         return Ok(());
     }
     let root = capture.folder.clone();
     attach(capture, &[root])?;
-    let mask = capture.present().find_map(|view| view.mask.clone());
+    let mask = capture.present().filter(is_masked).find_map(|view| view.mask.clone());
     if let Some(mask) = mask {
         let mask = mask.strip_prefix(&capture.folder).unwrap_or(&mask).display();
         let what = format!("no frame lists a mask: used those beside them, such as `{mask}` (white is used)");
@@ -85,11 +123,16 @@ pub(super) fn attach_unlisted(capture: &mut Capture) -> Result<()> {
     Ok(())
 }
 
+/// The name of an image without its folders.
+fn plain(name: &str) -> &Path {
+    Path::new(name).file_name().unwrap_or_default().as_ref()
+}
+
 /// The path of an image below its folder of images, if it starts with one.
 fn inner(name: &str) -> Option<&Path> {
     let (folder, inner) = name.split_once('/')?;
     let folder = folded(folder);
-    (IMAGES.contains(&&*folder) || folder.starts_with("images_")).then(|| Path::new(inner))
+    (IMAGES.contains(&&*folder) || factor_in(&folder, "images").is_some()).then(|| Path::new(inner))
 }
 
 /// The start of the names of instant-ngp's dynamic masks.
@@ -202,6 +245,8 @@ mod tests {
             places.iter().for_each(|place| picture(&folder.path().join(place).join("0.png"), 8, 6));
             attach(&mut capture, &[folder.path().to_owned()]).unwrap();
             let mask = capture.views.remove(0).mask?;
+            let is_noted = capture.assumptions.iter().any(|note| note.starts_with("there are no larger masks: used"));
+            assert_eq!(is_noted, mask.to_string_lossy().contains("sk_") || mask.to_string_lossy().contains("sks_"));
             Some(mask.parent()?.file_name()?.to_str()?.to_owned())
         };
         for (places, expected) in [
@@ -209,7 +254,14 @@ mod tests {
             (&["MASK"], Some("MASK")),
             (&["Masks", "masks"], Some("masks")),
             (&["mask", "Masks"], Some("Masks")),
+            (&["masks_4"], Some("masks_4")),
+            (&["Mask_2"], Some("Mask_2")),
+            (&["masks_8", "masks_4"], Some("masks_4")),
+            (&["masks_2", "mask"], Some("mask")),
             (&["masks_old"], None),
+            (&["masks_2024"], None),
+            (&["mask_1"], None),
+            (&["masks_"], None),
         ] {
             assert_eq!(found(places).as_deref(), expected, "{places:?}");
         }

@@ -28,6 +28,8 @@ pub mod rigid;
 pub mod transforms;
 mod unsupported;
 
+pub use locate::is_layer;
+
 pub(super) use description::{is_described, read, read_file};
 pub(super) use locate::{DEEPEST, factor_of, fitting};
 

@@ -59,6 +59,26 @@ fn vertical_angles_are_those_of_the_sensor() {
 }
 
 #[test]
+fn blender_masks_are_found() {
+    let folder = folder(|_| {});
+    let mask = folder.path().join("masks/train/r_1.png");
+    picture(&mask, 8, 6);
+    let capture = read(folder.path()).unwrap();
+    assert_eq!(capture.views.iter().map(|view| view.mask.clone()).collect::<Vec<_>>(), [None, Some(mask)]);
+    let [some, used] = &capture.assumptions[..] else { panic!("{:?}", capture.assumptions) };
+    assert_eq!(some, "1 of 2 images have a mask in `masks`; 1 have no mask, and use all pixels");
+    says(used, &["no frame lists a mask: used those beside them, such as `masks/train/r_1.png`"]);
+    // Without the folder of the split, if the name is that of a single image.
+    let plain = folder.path().join("masks/r_0.png");
+    picture(&plain, 8, 6);
+    assert_eq!(read(folder.path()).unwrap().views[0].mask, Some(plain));
+    std::fs::write(folder.path().join("transforms_test.json"), document(&["./test/r_0"]).to_string()).unwrap();
+    picture(&folder.path().join("test/r_0.png"), 8, 6);
+    let masks: Vec<_> = read(folder.path()).unwrap().views.iter().map(|view| view.mask.is_some()).collect();
+    assert_eq!(masks, [false, true, false]);
+}
+
+#[test]
 fn blender_splits_are_all_read() {
     let folder = folder(|d| d["aabb_scale"] = json!(2));
     let file = |split: &str, text: String| std::fs::write(folder.path().join(format!("transforms_{split}.json")), text);

@@ -206,7 +206,8 @@ fn masks_are_found_in_any_case() {
         let expected = is_found.then(|| folder.path().join("masks").join(mask));
         assert_eq!((&capture.views[0].mask, &capture.views[1].mask), (&expected, &None), "{mask}");
         let count = usize::from(is_found);
-        let said = format!("{count} of 2 images have a mask in `masks`; the others use all pixels");
+        let without = 2 - count;
+        let said = format!("{count} of 2 images have a mask in `masks`; {without} have no mask, and use all pixels");
         assert_eq!(capture.assumptions, [said]);
     }
 }

@@ -55,6 +55,137 @@ fn earlier_formats_have_priority() {
     }
 }
 
+/// Writes a file of frames with these paths, and a picture for each.
+fn write_frames(folder: &Path, file: &str, names: &[&str]) {
+    let document = serde_json::json!({ "camera_angle_x": 0.8, "frames": kit::frames(names) });
+    std::fs::create_dir_all(folder).unwrap();
+    std::fs::write(folder.join(file), document.to_string()).unwrap();
+    names.iter().for_each(|name| kit::picture(&folder.join(name), 8, 6));
+}
+
+/// The splits of the images by name, and the assumptions.
+fn splits_of(folder: &Path) -> (Vec<(String, Option<Split>)>, Vec<String>) {
+    let capture = Capture::read(folder).unwrap();
+    (capture.views.into_iter().map(|view| (view.name, view.split)).collect(), capture.assumptions)
+}
+
+#[test]
+fn splits_of_blenders_files_are_those_of_the_same_images() {
+    let folder = tempfile::tempdir().unwrap();
+    let names = ["images/0.png", "images/1.png", "images/2.png", "images/3.png"];
+    write_frames(folder.path(), "transforms.json", &names);
+    write_frames(folder.path(), "transforms_train.json", &names[..3]);
+    write_frames(folder.path(), "transforms_test.json", &names[3..]);
+    let [train, _, test] = Split::ALL.map(Some);
+    let expected: Vec<_> =
+        names.into_iter().zip([train, train, train, test]).map(|(name, split)| (name.to_owned(), split)).collect();
+    let note = "the splits are those of `transforms_train.json` and the files like it".to_owned();
+    assert_eq!(splits_of(folder.path()), (expected.clone(), vec![note.clone()]));
+    // A run reads the file that it has read before.
+    let file = folder.path().join("transforms.json");
+    let again = Capture::read_description(folder.path(), &file).unwrap();
+    assert_eq!(again.views.into_iter().map(|view| (view.name, view.split)).collect::<Vec<_>>(), expected);
+    // Images beside the folder of both.
+    std::fs::create_dir(folder.path().join("ngp")).unwrap();
+    for name in ["transforms.json", "transforms_train.json", "transforms_test.json"] {
+        std::fs::copy(folder.path().join(name), folder.path().join("ngp").join(name)).unwrap();
+    }
+    assert_eq!(splits_of(&folder.path().join("ngp")).0, expected);
+    // An image that they lack is in no split.
+    write_frames(folder.path(), "transforms_train.json", &names[..2]);
+    let (splits, notes) = splits_of(folder.path());
+    assert_eq!((splits[2].1, splits[3].1), (None, test));
+    let [counts, splits_note, unused] = &notes[..] else { panic!("{notes:?}") };
+    kit::says(counts, &["images found: `transforms.json` 4 of 4, `transforms_train.json` 3 of 3; used the first"]);
+    assert_eq!(splits_note, &note);
+    assert_eq!(unused, "1 images are in no split, such as `images/2.png`: they are not used");
+    // As many other images are no twin.
+    std::fs::remove_file(folder.path().join("transforms_train.json")).unwrap();
+    write_frames(folder.path(), "transforms_test.json", &["t/0.png", "t/1.png", "t/2.png", "t/3.png"]);
+    let (_, notes) = splits_of(folder.path());
+    kit::says(&notes[0], &["images found: `transforms.json` 4 of 4, `transforms_test.json` 4 of 4; used the first"]);
+    assert_eq!(notes.len(), 1);
+    // Files that are no JSON say nothing, and neither do those that give all images that exist one split.
+    std::fs::write(folder.path().join("transforms_test.json"), "{").unwrap();
+    let (_, notes) = splits_of(folder.path());
+    assert!(notes.iter().any(|note| note.starts_with("the splits of `transforms_test.json` and")), "{notes:?}");
+    write_frames(folder.path(), "transforms_test.json", &names);
+    std::fs::remove_file(folder.path().join("images/3.png")).unwrap();
+    let splits: Vec<_> = splits_of(folder.path()).0.into_iter().map(|(_, split)| split).collect();
+    assert_eq!(splits, [test, train, train, train], "every eighth");
+    // Lists of the file itself come first.
+    write_frames(folder.path(), "transforms_test.json", &names);
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::write(&file, text.replacen('{', "{\"test_filenames\": [\"images/0.png\"],", 1)).unwrap();
+    assert_eq!(splits_of(folder.path()).0[..2], [(names[0].to_owned(), test), (names[1].to_owned(), train)]);
+}
+
+#[test]
+fn folders_of_images_are_splits() {
+    use Split::{Test, Train, Val};
+    for (names, expected) in [
+        (&["train/0.png", "train/1.png", "test/2.png"][..], Some([Train, Train, Test])),
+        (&["images/Train/0.png", "images/EVAL/1.png", "images/train/2.png"], Some([Train, Val, Train])),
+        (&["test/train/0.png", "test/val/1.png", "test/test/2.png"], Some([Train, Val, Test])),
+        // All images are of one split, or some of none.
+        (&["train/0.png", "train/1.png", "train/2.png"], None),
+        (&["test/0.png", "test/1.png", "test/2.png"], None),
+        (&["a/0.png", "test/1.png", "train/2.png"], None),
+        (&["test/absent.png", "train/1.png", "train/2.png", "train/3.png"], None),
+        (&["training/0.png", "test/1.png", "train/2.png"], None),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        write_frames(folder.path(), "transforms.json", names);
+        let _ = std::fs::remove_file(folder.path().join("test/absent.png"));
+        let (splits, notes) = splits_of(folder.path());
+        let splits: Vec<_> = splits.into_iter().filter_map(|(_, split)| split).collect();
+        match expected {
+            Some(expected) => {
+                assert_eq!(splits, expected, "{names:?}");
+                kit::says(&notes[0], &["folders of the images are splits, such as that of `"]);
+            }
+            // Every eighth, from the first by name.
+            None => {
+                assert_eq!(splits, [vec![Test], vec![Train; names.len() - 1]].concat(), "{names:?}");
+                assert!(notes.is_empty(), "{notes:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn images_beside_the_folder_of_a_file_are_found() {
+    let folder = tempfile::tempdir().unwrap();
+    let inner = folder.path().join("ngp");
+    write_frames(&inner, "transforms.json", &["images/0.png", "images/1.png"]);
+    std::fs::rename(inner.join("images"), folder.path().join("images")).unwrap();
+    for path in [&inner, &inner.join("transforms.json")] {
+        let capture = read(path, None).unwrap();
+        assert_eq!(capture.present().count(), 2);
+        let [note] = &capture.assumptions[..] else { panic!("{:?}", capture.assumptions) };
+        kit::says(note, &["no images are beside `", "transforms.json`: used others, such as `images/0.png`"]);
+    }
+    // What is wrong with the images there is the error.
+    let file = inner.join("transforms.json");
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::write(&file, text.replacen("\"file_path\"", "\"mask_path\": \"masks/0.png\", \"file_path\"", 1)).unwrap();
+    kit::says(&read(&inner, None).unwrap_err().to_string(), &["there is no file masks/0.png: copy it there"]);
+    std::fs::write(&file, text).unwrap();
+    // Images of the same names in other folders are those of other captures.
+    std::fs::remove_dir_all(folder.path().join("images")).unwrap();
+    for other in ["b", "b/images"] {
+        (0..2).for_each(|i| kit::picture(&folder.path().join(other).join(format!("{i}.png")), 8, 6));
+        let capture = read(&inner, None).unwrap();
+        assert_eq!((capture.present().count(), capture.views.len(), capture.assumptions.len()), (0, 2, 0), "{other}");
+    }
+    std::fs::remove_dir_all(folder.path().join("b")).unwrap();
+    for near in ["images_2", "rgb", "."] {
+        (0..2).for_each(|i| kit::picture(&folder.path().join(near).join(format!("{i}.png")), 8, 6));
+        assert_eq!(read(&inner, None).unwrap().present().count(), 2, "{near}");
+        (0..2).for_each(|i| std::fs::remove_file(folder.path().join(near).join(format!("{i}.png"))).unwrap());
+    }
+}
+
 #[test]
 fn most_complete_description_counts() {
     let folder = tempfile::tempdir().unwrap();

@@ -222,7 +222,7 @@ fn llff_masks_are_found() {
     let folder = folder(&npy(&ROWS), &["images/a.png", "images/b.png", "masks/b.png"]);
     let capture = read(folder.path()).unwrap();
     assert_eq!((&capture.views[0].mask, &capture.views[1].mask), (&None, &Some(folder.path().join("masks/b.png"))));
-    assert_eq!(capture.assumptions, ["1 of 2 images have a mask in `masks`; the others use all pixels"]);
+    assert_eq!(capture.assumptions, ["1 of 2 images have a mask in `masks`; 1 have no mask, and use all pixels"]);
 }
 
 #[test]

@@ -245,3 +245,30 @@ fn listed_paths_count_as_they_stand() {
     finds(&["jpg/0.jpg", "raw/0.dng"], &["images/0.png"], &["jpg/0.jpg"]);
     finds(&["heic/0.HEIC", "jpg/0.jpg"], &["images/0.JPG"], &["jpg/0.jpg"]);
 }
+
+#[test]
+fn folders_of_splits_count_together() {
+    let names = ["images/0.png", "images/1.png", "images/2.png"];
+    let files = ["images/train/0.png", "images/train/1.png", "images/test/2.png"];
+    finds(&files, &names, &files);
+    let plain = names.map(|name| name.strip_prefix("images/").unwrap());
+    finds(&files, &plain, &files);
+    let outer = ["train/images/0.png", "train/images/1.png", "eval/images/2.png"];
+    finds(&outer, &names, &outer);
+    // The images of one split may be those of another file's.
+    finds(&files[..2], &names, &[""; 3]);
+    finds(&["images/train/0.png", "train/images/1.png"], &names[..2], &[""; 2]);
+    // Those of two captures are not those of one.
+    for other in ["b/images/train/1.png", "b/images/test/1.png"] {
+        finds(&["a/images/train/0.png", other], &names[..2], &[""; 2]);
+    }
+    // Names that state a split have no others.
+    finds(&files, &["val/0.png", "val/1.png", "val/2.png"], &[""; 3]);
+    refuses(
+        &["images/train/0.png", "images/test/0.png"],
+        &names[..1],
+        &["`images/test/0.png`", "`images/train/0.png`"],
+    );
+    // Images of no split come first.
+    finds(&["images/train/0.png", "images/test/1.png", "a/images/0.png"], &names[..2], &["a/images/0.png", ""]);
+}
