@@ -1,4 +1,5 @@
-//! Signals. The first Ctrl-C requests a stop, the second ends the program. SIGTERM and SIGHUP only request a stop.
+//! Signals. They end a program that has nothing to save. Of one that has, the first Ctrl-C requests a stop, and the second
+//! ends it. SIGTERM and SIGHUP only request a stop.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -31,19 +32,38 @@ impl From<Error> for Stop {
 
 static REQUESTED: AtomicBool = AtomicBool::new(false);
 
+/// From now on, signals end the program with [`EXIT_CODE`]. Called once, before any of the other functions.
+pub fn end_at_signals() {
+    let handler = |is_ctrl_c: bool| {
+        let said = *locked(&SAID);
+        if said.is_empty() {
+            std::process::exit(EXIT_CODE.into());
+        }
+        match REQUESTED.swap(true, Ordering::Relaxed) {
+            false => note(said),
+            // A closed terminal may send SIGHUP more than once, so that only Ctrl-C ends a program that stops.
+            true if is_ctrl_c => std::process::exit(EXIT_CODE.into()),
+            true => {}
+        }
+    };
+    if let Err(error) = system::listen(handler) {
+        complain(&format!("warning: signals such as Ctrl-C will end raygrad without saving its work: {error}"));
+    }
+}
+
 /// The first Ctrl-C sets [`requested`], a second one ends the program at once.
 pub fn listen() {
-    set("stopping after this step; Ctrl-C again stops at once", "save the model");
+    *locked(&SAID) = "stopping after this step; Ctrl-C again stops at once";
 }
 
 /// Like [`listen`], for frames that the same command can resume.
 pub fn listen_to_go_on() {
-    set("stopping after this frame; Ctrl-C again stops at once", "finish this frame");
+    *locked(&SAID) = "stopping after this frame; Ctrl-C again stops at once";
 }
 
 /// Like [`listen`], for work whose unfinished result is removed.
 pub fn listen_to_remove() {
-    set("stopping and removing unfinished files; Ctrl-C again stops at once", "remove unfinished files");
+    *locked(&SAID) = "stopping and removing unfinished files; Ctrl-C again stops at once";
 }
 
 /// The end of standard input counts as a Ctrl-C. It shows that the parent program has ended.
@@ -54,25 +74,8 @@ pub fn listen_to_input() {
     });
 }
 
-/// The line for the first Ctrl-C; empty before this program listens.
+/// The line for the first Ctrl-C; empty while the program has nothing to save.
 static SAID: Mutex<&str> = Mutex::new("");
-
-/// Sets the line for the first Ctrl-C. Listens from the first call on: a second handler would end the program at once.
-fn set(said: &'static str, promise: &str) {
-    let line = || locked(&SAID);
-    if !std::mem::replace(&mut *line(), said).is_empty() {
-        return;
-    }
-    let handler = move |is_ctrl_c: bool| match REQUESTED.swap(true, Ordering::Relaxed) {
-        false => note(*line()),
-        // A closed terminal may send SIGHUP more than once, so that only Ctrl-C ends the program.
-        true if is_ctrl_c => std::process::exit(EXIT_CODE.into()),
-        true => {}
-    };
-    if let Err(error) = system::listen(handler) {
-        complain(&format!("warning: Ctrl-C will not {promise}: {error}"));
-    }
-}
 
 /// Returns true if a stop was requested.
 pub fn requested() -> bool {

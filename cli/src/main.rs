@@ -112,6 +112,7 @@ fn main() -> ExitCode {
 }
 
 fn run(cli: Cli) -> Work<ExitCode> {
+    interrupt::end_at_signals();
     simd::check_environment().map_err(|what| Error::setting("environment", what))?;
     let is_shared = match &cli.command {
         None | Some(Command::Train(_)) => true,

@@ -3,7 +3,7 @@
 //! A command writes a mark into its files: a checksum of its arguments. So the same command may replace its output, but
 //! no other file.
 
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io::{ErrorKind, Read};
 use std::path::Path;
 
@@ -49,7 +49,8 @@ impl Job {
         file.is_file() && open().unwrap_or(false)
     }
 
-    /// Checks that a file may be written. Called before the work, and again before the file is replaced.
+    /// Checks that a file may be written. Called before the work, and again before the file is replaced. An empty file
+    /// holds nothing to lose.
     ///
     /// # Errors
     ///
@@ -59,10 +60,20 @@ impl Job {
             Err(e) if e.kind() == ErrorKind::NotFound => Ok(()),
             Err(e) => Err(Error::file(out, format!("cannot be written: {e}"))),
             Ok(_) if out.is_dir() => Err(Error::file(out, "is a folder, not a file")),
-            Ok(_) if self.overwrites || self.wrote(out) => Ok(()),
+            Ok(about) if self.overwrites || is_empty(&about) || self.wrote(out) => Ok(()),
             Ok(_) => Err(taken(out)),
         }
     }
+}
+
+/// Returns true for a file without contents, such as a loss of power may leave.
+fn is_empty(about: &Metadata) -> bool {
+    about.is_file() && about.len() == 0
+}
+
+/// Returns true if a path is that of a file with contents, or of something else than a file.
+pub fn is_occupied(path: &Path) -> bool {
+    path.symlink_metadata().is_ok_and(|about| !is_empty(&about))
 }
 
 /// The error for an existing file.

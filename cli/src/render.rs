@@ -197,6 +197,9 @@ pub fn run(args: &Args) -> Work<()> {
     if let Some(skip) = args.skip {
         model.set_skip(skip);
     }
+    if args.scene.is_some() && args.flight.path == CameraPath::Orbit && !args.ends_with_input {
+        note("--scene is not used: an orbit needs no images");
+    }
     let CameraMotion { cameras, fps } = args.flight.cameras(&run, &model, args.scene.as_ref())?;
     let extent = model.scene_box;
     let background = args.background.unwrap_or(model.config.background.shown());
@@ -275,7 +278,8 @@ pub fn merge(complete: Complete) -> Work<()> {
         Kind::Video(_) => video_of(&folder)?,
         _ => folder.clone(),
     };
-    let (frames, job) = Frames::of_shards(complete, of)?;
+    let save = Vec::<Layer>::deserialize(&of["save"]).map_err(|e| Error::file(&folder, e))?;
+    let (frames, job) = Frames::of_shards(complete, of, &save)?;
     let again = format!("run `raygrad merge {}`", quoted(&folder));
     output.complete(frames, &job, &out, Some(&again))
 }

@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::lock::{Lock, State, UNFINISHED};
-use super::output::{check_writable, complain, entries, listed, quoted, remove};
+use super::output::{check_writable, complain, entries, is_written, listed, quoted, remove};
 use super::parse::read_text;
 use super::run::write_json;
 use super::scratch::ScratchFolder;
@@ -406,14 +406,14 @@ impl Complete {
         self.own.iter().enumerate().map(|(i, own)| parsed(&file_of(&self.at, i + 1), own)).collect()
     }
 
-    /// Checks that a file of an item exists.
+    /// Checks that a file of an item exists and is not empty.
     pub fn check(&self, item: usize, path: &Path) -> Result<()> {
-        if path.is_file() {
+        if is_written(path) {
             return Ok(());
         }
         let shard = Shard { number: item % self.own.len() + 1, count: self.own.len() };
         let record = file_of(&self.at, shard.number);
-        Err(Error::file(path, format!("is missing: remove {} and run shard {shard} again", record.display())))
+        Err(Error::file(path, format!("is missing or empty: remove {} and run shard {shard} again", record.display())))
     }
 }
 

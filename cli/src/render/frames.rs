@@ -1,15 +1,17 @@
 //! Numbered frames in a folder, which an interrupted command can resume.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+use clap::ValueEnum;
 use raygrad::nerf::{Error, Result, create_folder, write_atomic};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::shown::Layer;
 use crate::lock::{Lock, UNFINISHED};
-use crate::output::{complain, make_folder, note, numbered, other_numbered, parent, print, remove};
-use crate::overwrite::{Job, png_with_text, taken};
+use crate::output::{complain, is_written, make_folder, note, numbered, other_numbered, parent, print, remove};
+use crate::overwrite::{Job, is_occupied, png_with_text, taken};
 use crate::parse::read_text;
 use crate::run::write_json;
 use crate::shard::{self, Complete, Part, Shard, Whole};
@@ -85,7 +87,8 @@ impl Frames {
             note(&format!("{}: replacing {done} frames that were rendered with another {others}", folder.display()));
         }
         let done = left.filter(|left| left.of == of).map_or(0, |left| left.done);
-        let done = (0..done).take_while(|&frame| path(&folder, frame).is_file()).count();
+        let done = (0..done).take_while(|&frame| is_complete(&folder, frame, save)).count();
+        note_layers(&folder, done..count, save);
         let record = Record { of, job: job.mark().to_owned(), done, strange };
         let frames = Frames { folder, job: job.clone(), count, claim: Claim::All(record, lock) };
         frames.write()?;
@@ -110,14 +113,16 @@ impl Frames {
             false => begun.iter().all(|facts| facts.strange),
         };
         let mut part = Part::open(&folder, shard, whole, json!(Facts { job: job.clone(), strange }))?;
-        part.retain(|frame| path(&folder, frame).is_file())?;
+        part.retain(|frame| is_complete(&folder, frame, save))?;
         Ok(Frames { folder, job: job.clone(), count, claim: Claim::Shard(part) })
     }
 
-    /// The frames of complete shards, made from `of`. Returns them with their job.
-    pub fn of_shards(complete: Complete, of: Value) -> Result<(Self, Job)> {
+    /// The frames of complete shards, made from `of` with layers `save`. Returns them with their job.
+    pub fn of_shards(complete: Complete, of: Value, save: &[Layer]) -> Result<(Self, Job)> {
         let (folder, count) = (complete.at().to_owned(), complete.whole.items);
-        (0..count).try_for_each(|frame| complete.check(frame, &path(&folder, frame)))?;
+        for frame in 0..count {
+            files(&folder, frame, save).try_for_each(|file| complete.check(frame, &file))?;
+        }
         let facts: Vec<Facts> = complete.own()?;
         let strange = facts.iter().all(|facts| facts.strange);
         let Some(Facts { job, .. }) = facts.into_iter().next() else {
@@ -257,6 +262,29 @@ pub fn record(folder: &Path) -> Option<Record> {
     read_text(&folder.join(RECORD), "a record of frames").ok().and_then(|text| serde_json::from_str(&text).ok())
 }
 
+/// The files of a frame: its layers and its image.
+fn files<'a>(folder: &'a Path, frame: usize, save: &'a [Layer]) -> impl Iterator<Item = PathBuf> + 'a {
+    save.iter().map(move |layer| beside(folder, frame, *layer)).chain([path(folder, frame)])
+}
+
+/// Returns true if all files of a frame were written.
+fn is_complete(folder: &Path, frame: usize, save: &[Layer]) -> bool {
+    files(folder, frame, save).all(|file| is_written(&file))
+}
+
+/// A note on layers beside frames that will be replaced without them. They may be the user's, so they are kept.
+fn note_layers(folder: &Path, frames: Range<usize>, save: &[Layer]) {
+    let replaced = frames.filter(|frame| path(folder, *frame).is_file());
+    let others = || Layer::value_variants().iter().filter(|layer| !save.contains(layer));
+    let left: Vec<PathBuf> =
+        replaced.flat_map(|frame| others().map(move |layer| beside(folder, frame, *layer))).collect();
+    let left: Vec<&PathBuf> = left.iter().filter(|file| file.is_file()).collect();
+    if let Some(first) = left.first() {
+        let (count, first) = (left.len(), first.display());
+        note(&format!("{count} layers of earlier frames stay, such as {first}: they do not belong to the new frames"));
+    }
+}
+
 /// The file of a frame's layer.
 fn beside(folder: &Path, frame: usize, layer: Layer) -> PathBuf {
     let (name, ending) = layer.place();
@@ -270,10 +298,8 @@ fn check(folder: &Path, left: Option<&Record>, of: &Value, job: &Job, count: usi
         return Ok(());
     }
     for frame in 0..count {
-        let picture = folder.join(numbered(frame, DIGITS));
-        let files = save.iter().map(|layer| beside(folder, frame, *layer)).chain([picture.clone()]);
-        let there: Vec<PathBuf> = files.filter(|file| file.symlink_metadata().is_ok()).collect();
-        let Some(file) = there.first().filter(|_| !job.wrote(&picture)) else { continue };
+        let there: Vec<PathBuf> = files(folder, frame, save).filter(|file| is_occupied(file)).collect();
+        let Some(file) = there.first().filter(|_| !job.wrote(&path(folder, frame))) else { continue };
         return Err(match left {
             Some(_) => Error::file(
                 folder,
@@ -409,6 +435,31 @@ mod tests {
         std::fs::write(folder.join("0000.png"), b"photograph").unwrap();
         assert!(frames.push(0, &[1], &[]).unwrap_err().to_string().contains("0000.png: exists"));
         assert_eq!(std::fs::read(folder.join("0000.png")).unwrap(), b"photograph");
+    }
+
+    #[test]
+    fn frames_without_all_their_files_are_rendered_again() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("frames");
+        let mut first = frames(&folder, 1);
+        for i in 0..3_u8 {
+            first.push(i.into(), &[i], &[(Layer::DepthNpy, vec![10 + i])]).unwrap();
+        }
+        drop(first);
+        for (file, done) in [("depth/0002.npy", 2), ("0001.png", 1), ("depth/0000.npy", 0)] {
+            let bytes = std::fs::read(folder.join(file)).unwrap();
+            std::fs::write(folder.join(file), "").unwrap();
+            let mut again = frames(&folder, 1);
+            assert_eq!(again.done(), done, "{file} is empty");
+            for i in done..3 {
+                again.push(i, &[i as u8], &[(Layer::DepthNpy, vec![10 + i as u8])]).unwrap();
+            }
+            assert_eq!(std::fs::read(folder.join(file)).unwrap(), bytes);
+            drop(again);
+            assert_eq!(frames(&folder, 1).done(), 3);
+        }
+        std::fs::remove_file(folder.join("depth/0001.npy")).unwrap();
+        assert_eq!(frames(&folder, 1).done(), 1);
     }
 
     #[test]

@@ -25,7 +25,7 @@ pub enum Show {
 }
 
 /// Layer files of each frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Layer {
     /// Depth along the optical axis: depth/NUMBER.png, 16 bits in steps of --depth-unit, 0 where there is nothing

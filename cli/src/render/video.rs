@@ -135,7 +135,8 @@ impl VideoFormat {
         command.args(["-color_trc", "iec61966-2-1", "-color_range", "tv"]);
         command.args(["-c:v", self.encoder(), "-metadata", &format!("comment={}", job.mark())]);
         command.args(match self {
-            VideoFormat::Webm => &["-crf", "24", "-b:v", "0", "-f", "webm"][..],
+            // Without random identifiers, the same frames give the same file.
+            VideoFormat::Webm => &["-crf", "24", "-b:v", "0", "-fflags", "+bitexact", "-f", "webm"][..],
             _ => &["-crf", "18", "-preset", "slow", "-movflags", "+faststart", "-f", "mp4"],
         });
         command.arg(file_url(file)?);
@@ -163,7 +164,10 @@ fn animate(
         if interrupt::requested() {
             return Err(Stop::Interrupted);
         }
-        animation.push(&Image::open(reel.folder.join(numbered(frame, DIGITS)))?).map_err(bad)?;
+        let picture = reel.folder.join(numbered(frame, DIGITS));
+        let again =
+            |e: Error| Error::file(&picture, format!("cannot be read ({e}): remove it, and repeat the command"));
+        animation.push(&Image::open(&picture).map_err(again)?).map_err(bad)?;
         progress.count(frame + 1, reel.count, IN_FILM);
     }
     Ok(animation.finish().map_err(bad)?)

@@ -61,6 +61,7 @@ impl Args {
         if let Budget::Time(_) = self.budget() {
             config = config.with_cores(cores());
         }
+        self.check_set()?;
         let config = self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))?;
         let config = config.with_batch_scale(self.batch_scale);
         if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
@@ -69,6 +70,26 @@ impl Args {
             return Err(Error::setting("preset", what));
         }
         Ok(config)
+    }
+
+    /// Fails if `--set` replaces what another flag gives.
+    fn check_set(&self) -> Result<()> {
+        let flags = [
+            ("seed", self.seed != 0, "seed"),
+            ("background", self.background.is_some(), "background"),
+            ("carve", self.carve.is_some(), "sampler.occupancy.skip.carving"),
+            ("loss", !self.loss.is_empty(), "loss_terms"),
+            ("depth-loss", self.depth_loss.is_some(), "loss_terms"),
+        ];
+        for (name, _) in &self.set {
+            let is_replaced = |key: &str| {
+                key.strip_prefix(name.as_str()).is_some_and(|rest| !rest.starts_with(char::is_alphanumeric))
+            };
+            if let Some((flag, ..)) = flags.iter().find(|(_, is_given, key)| *is_given && is_replaced(key)) {
+                return Err(Error::setting(name, format!("replaces what --{flag} gives: leave out one of them")));
+            }
+        }
+        Ok(())
     }
 
     /// The most cells along the scene box, or across the NDC frustum, that a hash grid may have with the budget;
@@ -236,6 +257,28 @@ mod tests {
         assert_eq!(config("--batch-scale 4 --set poses={\"constant\":{\"lr\":0.1}}").poses.unwrap().lr(0.5), 0.2);
         let proposal = config(r#"--batch-scale 3 --set sampler={"kind":"proposal"}"#).sampler;
         assert_eq!(proposal.get::<ProposalConfig>().unwrap().batch, 3 * ProposalConfig::default().batch);
+    }
+
+    #[test]
+    fn set_replaces_no_other_flag() {
+        let data = raygrad_scenes::landscape(raygrad::nerf::dataset::Split::Test, 8);
+        let read = |flags: &str| Args::parse_from(format!("train {flags}").split_whitespace()).config(&data);
+        for (flags, flag) in [
+            ("--seed 3 --set seed=5", "seed"),
+            ("--background black --set background=\"white\"", "background"),
+            ("--loss entropy=0.1 --set loss_terms=[]", "loss"),
+            ("--depth-loss --set loss_terms=[]", "depth-loss"),
+            ("--carve 2 --set sampler.occupancy.skip.carving=3", "carve"),
+            ("--carve 2 --set sampler.occupancy={}", "carve"),
+        ] {
+            let message = read(flags).unwrap_err().to_string();
+            assert!(message.ends_with(&format!("replaces what --{flag} gives: leave out one of them")), "{message}");
+        }
+        for flags in
+            ["--set seed=5", "--carve 2 --set sampler.samples=5000", "--loss entropy=0.1 --set loss_terms.1.weight=2"]
+        {
+            read(flags).unwrap();
+        }
     }
 
     #[test]

@@ -275,6 +275,15 @@ fn saved_layers_belong_to_their_frames() {
         assert!(solid > 20, "{solid} pixels of {frame} are solid");
     }
     assert!(!place.path("frames/unfinished.json").exists());
+    // Layers of frames that were replaced without them stay, with a note.
+    let noted = |flags: &str| {
+        let arguments = format!("render run --frames 2 --size 20x14 {flags} --out frames --overwrite");
+        String::from_utf8(place.command(&arguments).output().unwrap().stderr).unwrap()
+    };
+    let note = "8 layers of earlier frames stay, such as frames/depth/0000.npy: they do not belong to the new";
+    assert!(noted("--save depth").contains(note));
+    std::fs::remove_dir_all(place.path("frames/depth")).unwrap();
+    assert_eq!(noted("--save normals,opacity,alpha"), "");
     // A warning counts the depths beyond 16 bits.
     let output = place.command("render run --frames 1 --save depth --depth-unit 1e-6 --out fine").output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
@@ -294,6 +303,27 @@ fn depths_are_along_the_axis() {
     // of 3/5.
     for (found, expected) in depths.iter().zip([12.0, 20.0, 12.0]) {
         assert!((found - expected).abs() < 1e-5, "{depths:?}");
+    }
+}
+
+#[test]
+fn flags_beyond_what_exists_are_noted() {
+    let place = Place::with_run();
+    let said = |arguments: &str| {
+        let output = place.command(arguments).output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        String::from_utf8(output.stderr).unwrap()
+    };
+    for (arguments, expected) in [
+        ("render run --path test --frames 9 --size 4x4 --out a", "--frames 9: there are only 3 test images"),
+        ("render run --path test --frames 3 --size 4x4 --out b", ""),
+        ("eval run --views 9", "--views 9: there are only 3 images to compare"),
+        ("eval run --views 3", ""),
+        ("render run --frames 1 --size 4x4 --out c --scene scene", "--scene is not used: an orbit needs no images"),
+        ("render run --path test --frames 1 --size 4x4 --out d --scene scene", ""),
+    ] {
+        let said = said(arguments);
+        assert!(said.contains(expected) && said.is_empty() == expected.is_empty(), "{arguments}: {said}");
     }
 }
 
@@ -337,6 +367,21 @@ pub fn has_ffmpeg() -> bool {
         skipped("ffmpeg is not installed");
     }
     found
+}
+
+#[test]
+fn ffmpeg_writes_the_same_bytes_again() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let place = Place::with_run();
+    for ending in ["webm", "mp4"] {
+        let written = |name: &str| {
+            place.succeeds(&format!("render run --frames 2 --size 16x16 --out {name}.{ending}"));
+            place.bytes(&format!("{name}.{ending}"))
+        };
+        assert!(written("one") == written("two"), "{ending}");
+    }
 }
 
 #[test]

@@ -256,8 +256,23 @@ fn merge_makes_the_result_of_complete_shards() {
     unmerged(&place, &format!("{render} film.gif"), "film.gif.frames");
     let frame = place.path("film.gif.frames/0004.png");
     std::fs::rename(&frame, place.path("aside")).unwrap();
-    place.fails("merge film.gif", &["0004.png: is missing: remove ", "shard-1.json and run shard 1/2 again"]);
+    for there in [false, true] {
+        if there {
+            std::fs::write(&frame, "").unwrap();
+        }
+        let expected = ["0004.png: is missing or empty: remove ", "shard-1.json and run shard 1/2 again"];
+        place.fails("merge film.gif", &expected);
+    }
     std::fs::rename(place.path("aside"), &frame).unwrap();
+    // The layers are part of a frame.
+    let layers = "render run --frames 2 --size 8x6 --save opacity --out layers";
+    unmerged(&place, layers, "layers");
+    std::fs::write(place.path("layers/opacity/0001.png"), "").unwrap();
+    std::fs::write(place.path("layers/0001.png"), "").unwrap();
+    place.fails("merge layers", &["/0001.png: is missing or empty: remove ", "and run shard 2/2 again"]);
+    std::fs::remove_file(place.path(&format!("layers/{FOLDER}/shard-2.json"))).unwrap();
+    place.succeeds(&format!("{layers} --shard 2/2"));
+    assert!(files(&place, "layers").len() == 4 && files(&place, "layers").values().all(|bytes| !bytes.is_empty()));
     // Records of two jobs. The folder held other images only if all shards saw them.
     let first = place.path(&format!("film.gif.frames/{FOLDER}/shard-1.json"));
     let sound = record(&place, "film.gif.frames", 1).unwrap();
@@ -327,7 +342,7 @@ fn prepare_in_shards_equals_the_whole() {
     // A shard converts what has gone, and only that.
     let image = |i: usize| place.path(&format!(".made-unfinished-shards/dataset/images/train/r_{i}.png"));
     std::fs::remove_file(image(2)).unwrap();
-    place.fails("merge made", &["r_2.png: is missing: remove ", "shard-1.json and run shard 1/2 again"]);
+    place.fails("merge made", &["r_2.png: is missing or empty: remove ", "shard-1.json and run shard 1/2 again"]);
     let before = std::fs::metadata(image(0)).unwrap().modified().unwrap();
     let second = place.path(&format!(".made-unfinished-shards/{FOLDER}/shard-2.json"));
     std::fs::rename(&second, place.path("aside")).unwrap();

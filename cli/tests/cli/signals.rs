@@ -76,6 +76,16 @@ fn repeated_hang_ups_save_the_model() {
 }
 
 #[test]
+fn commands_without_work_to_save_end_with_their_code() {
+    let place = Place::with_run();
+    for signal in ["INT", "TERM", "HUP"] {
+        let mut server = super::view::serve(&place, "view run");
+        send(&server.child, signal);
+        assert_eq!(server.child.wait().unwrap().code(), Some(130), "{signal}");
+    }
+}
+
+#[test]
 fn second_ctrl_c_ends_at_once() {
     let place = Place::with_run();
     // One image takes minutes.
