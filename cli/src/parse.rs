@@ -167,7 +167,9 @@ pub fn read_text(path: &Path, kind: &str) -> raygrad::nerf::Result<String> {
     if !about.is_file() {
         return Err(bad(format!("not {kind}: it is not a regular file")));
     }
-    std::fs::read_to_string(path).map_err(unread)
+    let text = std::fs::read_to_string(path).map_err(unread)?;
+    // Editors of Windows write a byte-order mark.
+    Ok(text.strip_prefix('\u{feff}').map(str::to_owned).unwrap_or(text))
 }
 
 #[cfg(test)]
@@ -223,6 +225,8 @@ mod tests {
         let file = folder.path().join("path.json");
         std::fs::write(&file, "{}").unwrap();
         assert_eq!(read_text(&file, "a camera path").unwrap(), "{}");
+        std::fs::write(&file, "\u{feff}{}").unwrap();
+        assert_eq!(read_text(&file, "a camera path").unwrap(), "{}", "without a byte-order mark");
         std::fs::write(&file, [0xff]).unwrap();
         assert!(read_text(&file, "a camera path").unwrap_err().to_string().contains("path.json: cannot be read"));
         std::fs::File::create(&file).unwrap().set_len((1 << 28) + 1).unwrap();

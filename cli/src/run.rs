@@ -226,11 +226,22 @@ impl Run {
         self.file("model.safetensors")
     }
 
+    /// Returns true if the file that the run was trained on is gone from its folder: another would have other cameras.
+    fn lacks_description(&self, folder: &Path) -> bool {
+        folder.is_dir() && self.config.description.as_ref().is_some_and(|file| !folder.join(file).is_file())
+    }
+
     /// The scene of the images: `given`, or else the one of training.
     pub fn scene<'a>(&'a self, given: Option<&'a Scene>) -> Result<&'a Scene> {
         match (given, &self.config.scene) {
             (None, Scene::Folder(folder)) if !folder.exists() => {
                 Err(Error::file(folder, "the run's images are no longer here: name their folder with --scene"))
+            }
+            (None, Scene::Folder(folder)) if self.lacks_description(folder) => {
+                let file = folder.join(self.config.description.as_deref().unwrap_or(Path::new("")));
+                let what = "the run was trained on this file, which is no longer here: put it back, or name another \
+                            capture with --scene";
+                Err(Error::file(file, what))
             }
             (given, trained) => Ok(given.unwrap_or(trained)),
         }

@@ -67,7 +67,7 @@ impl Target {
 
     /// Whether the format stores which images are held out.
     fn has_splits(self) -> bool {
-        matches!(self, Target::Nerfstudio | Target::Blender)
+        self != Target::Llff
     }
 
     /// Where in a folder of this format an image is, and what its view is called. `inner` is its path among the images.
@@ -348,6 +348,15 @@ fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
     if dynamic > 0 && target == Target::Nerfstudio {
         warnings.push(format!("{dynamic} dynamic masks become a `mask_path`, which instant-ngp does not read"));
     }
+    if target == Target::Nerfstudio {
+        for (count, what) in [(masks, "masks"), (depths, "depths")] {
+            if (1..capture.views.len()).contains(&count) {
+                let all = capture.views.len();
+                warnings
+                    .push(format!("{count} of {all} images have {what}: nerfstudio reads those of all images or none"));
+            }
+        }
+    }
     if depths > 0 && !target.has_depths() {
         warnings.push(format!("{depths} depth files are not converted: the format has none"));
     } else if depths > 0 && undistorted {
@@ -566,16 +575,23 @@ mod tests {
         let depths = "2 depth files are not converted: the format has none";
         let split = "3 held-out images lose their split, which the format cannot store: readers may hold out others, such \
                      as every eighth";
+        let some = ["masks", "depths"].map(|what| {
+            let count = if what == "masks" { 1 } else { 2 };
+            format!("{count} of 5 images have {what}: nerfstudio reads those of all images or none")
+        });
+        let some = some.each_ref().map(String::as_str);
         for (target, expected) in [
-            (Target::Nerfstudio, vec![]),
+            (Target::Nerfstudio, some.to_vec()),
             (Target::Blender, vec![masks, depths]),
-            (Target::Colmap, vec![depths, split]),
-            (Target::ColmapText, vec![depths, split]),
+            (Target::Colmap, vec![depths]),
+            (Target::ColmapText, vec![depths]),
             (Target::Llff, vec![masks, depths, split]),
         ] {
             assert_eq!(lost(&capture, target, false), expected, "{target:?}");
             let undistorted = match target {
-                Target::Nerfstudio => vec!["2 depth files are not converted: --undistort does not change them"],
+                Target::Nerfstudio => {
+                    [&some[..], &["2 depth files are not converted: --undistort does not change them"]].concat()
+                }
                 _ => expected,
             };
             assert_eq!(lost(&capture, target, true), undistorted, "{target:?} undistorted");
@@ -583,11 +599,12 @@ mod tests {
         let mut dynamic = View { mask_is_dynamic: true, mask: Some("dynamic_mask_0.png".into()), ..view(None) };
         let mut capture = Capture { views: vec![dynamic.clone(), view(None)], ..capture };
         let warning = "1 dynamic masks become a `mask_path`, which instant-ngp does not read";
-        assert_eq!(lost(&capture, Target::Nerfstudio, false), [warning]);
+        let some = "1 of 2 images have masks: nerfstudio reads those of all images or none";
+        assert_eq!(lost(&capture, Target::Nerfstudio, false), [warning, some]);
         assert_eq!(lost(&capture, Target::Colmap, false), [""; 0]);
         dynamic.mask_is_dynamic = false;
         capture.views[0] = dynamic;
-        assert_eq!(lost(&capture, Target::Nerfstudio, false), [""; 0]);
+        assert_eq!(lost(&capture, Target::Nerfstudio, false), [some]);
         let capture = Capture { views: vec![view(Some(Split::Train)), view(None)], ..capture };
         assert_eq!(lost(&capture, Target::Llff, false), Vec::<String>::new());
     }

@@ -117,8 +117,7 @@ struct Ngp {
     closed: bool,
     #[serde(rename = "time")]
     _time: Option<f64>,
-    #[serde(rename = "duration_seconds")]
-    _duration_seconds: Option<f64>,
+    duration_seconds: Option<f64>,
     spline_order: Option<u32>,
 }
 
@@ -325,8 +324,9 @@ fn ngp(file: &File, path: Ngp, to_capture: &DAffine3) -> Result<Path> {
         times = vec![1.0; keys.len()];
     }
     times.truncate(legs);
+    let seconds = path.duration_seconds.filter(|seconds| *seconds > 0.0 && *seconds <= 1e6);
     let path = CameraPath::timed(keys, times, closed, Curve::Near);
-    Ok(Path { motion: Motion::Keys { path, seconds: None }, size: None, fps: None })
+    Ok(Path { motion: Motion::Keys { path, seconds }, size: None, fps: None })
 }
 
 fn count(file: &File, field: &str, count: usize) -> Result<()> {

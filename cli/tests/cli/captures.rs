@@ -232,6 +232,23 @@ fn images_in_no_split_are_not_counted() {
 }
 
 #[test]
+fn runs_do_not_switch_to_another_description() {
+    let place = Place::with_scene();
+    place.succeeds("prepare scene --to nerfstudio --out both");
+    place.succeeds("prepare scene --to colmap --out other");
+    std::fs::rename(place.path("other/sparse"), place.path("both/sparse")).unwrap();
+    place.succeeds(&format!("train both --format colmap --steps 1 --out run {SMALL}"));
+    place.succeeds("eval run");
+    std::fs::rename(place.path("both/sparse"), place.path("aside")).unwrap();
+    let expected = ["both/sparse/0/images.bin: the run was trained on this file, which is no longer here: put it back"];
+    for command in ["eval run", "export run cameras.json", "train --resume run --steps 2"] {
+        place.fails(command, &expected);
+    }
+    std::fs::rename(place.path("aside"), place.path("both/sparse")).unwrap();
+    place.succeeds("train --resume run --steps 2");
+}
+
+#[test]
 fn runs_keep_the_splits_of_blenders_files() {
     let place = Place::with_scene();
     let mut transforms = place.transforms(Split::Train);

@@ -701,6 +701,11 @@ fn bad_runs_are_named() {
             edited("/scene_box/near_far", json!([6.0, 2.0])),
             ["run/config.json", "`scene_box.near_far`: is 6 to 2; near must"],
         ),
+        (
+            edited("/scene_box/transform/scale", json!(0.0)),
+            ["run/config.json", "`scene_box.transform`: needs a rotation"],
+        ),
+        (edited("/scene_box/transform/rotation/0", json!(2.0)), ["run/config.json", "`scene_box.transform`: needs"]),
         (edited("/scene_box/bounds/0/0", json!(9.0)), ["`bounds`", "use finite corners, the lower below the upper"]),
         (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`: is 0; use 1 to 65536"]),
         (
@@ -722,6 +727,11 @@ fn bad_runs_are_named() {
     let model = place.bytes("run/model.safetensors");
     std::fs::write(place.path("run/model.safetensors"), &model[..model.len() / 2]).unwrap();
     place.fails("eval run", &["run/model.safetensors: not a safetensors file"]);
+    let mut damaged = model.clone();
+    let end = damaged.len();
+    damaged[end - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
+    std::fs::write(place.path("run/model.safetensors"), damaged).unwrap();
+    place.fails("eval run", &["run/model.safetensors: is damaged: `", "` has values that are not finite"]);
     std::fs::remove_file(place.path("run/model.safetensors")).unwrap();
     place.fails("render run", &["run: has no model.safetensors; `raygrad train --resume run` writes it"]);
     assert!(!place.path("run/eval-test.json").exists() && !place.path("run/orbit").exists());

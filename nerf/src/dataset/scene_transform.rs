@@ -65,7 +65,7 @@ impl SceneTransform {
         if rotates && self.scale > 0.0 && self.scale.is_finite() && self.origin.is_finite() {
             return Ok(());
         }
-        Err(Error::setting("transform", "needs a rotation matrix, a scale above 0 and a finite origin"))
+        Err(Error::setting("scene_box.transform", "needs a rotation matrix, a scale above 0 and a finite origin"))
     }
 
     /// Maps a point from the capture to the scene.
@@ -161,7 +161,7 @@ mod tests {
             SceneTransform { rotation: -rotation, ..transform },
             SceneTransform { origin: DVec3::INFINITY, ..transform },
         ] {
-            assert!(wrong.check().unwrap_err().to_string().starts_with("`transform`"));
+            assert!(wrong.check().unwrap_err().to_string().starts_with("`scene_box.transform`"));
         }
     }
 }

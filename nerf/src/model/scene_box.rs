@@ -45,12 +45,13 @@ impl SceneBox {
         }
     }
 
-    /// Checks that near and far are in range. [`Space::check`] checks the rest.
+    /// Checks that near and far are in range, and that the transform is a similarity. [`Space::check`] checks the rest.
     ///
     /// # Errors
     /// If they are not.
     pub fn check(&self) -> Result<()> {
         let [near, far] = self.near_far;
+        self.transform.check()?;
         if near >= 0.0 && near < far && far.is_finite() {
             return Ok(());
         }

@@ -35,7 +35,8 @@ impl Model<f32> {
     /// Reads a model that [`save`](Self::save) wrote, with the same configuration and scene box.
     ///
     /// # Errors
-    /// If the file cannot be read, has a later format version, or belongs to another configuration.
+    /// If the file cannot be read, has a later format version, belongs to another configuration, or has a value that is
+    /// not finite.
     pub fn load(path: impl AsRef<Path>, config: Config, extent: SceneBox) -> Result<Self> {
         let bytes = std::fs::read(&path).map_err(|error| Error::file(&path, error))?;
         check_version(&bytes).map_err(|error| Error::file(&path, error))?;
@@ -44,6 +45,10 @@ impl Model<f32> {
         let cameras = cameras(stored.as_deref()).map_err(|error| Error::file(&path, error))?;
         let mut model = Model::with_cameras(config, extent, &cameras, 0)?;
         let state = model.params.load_safetensors(&bytes).map_err(|error| Error::file(&path, error))?;
+        if let Some((name, _)) = model.params.iter().find(|(_, value)| !value.is_finite()) {
+            let what = format!("is damaged: `{name}` has values that are not finite; copy the file again");
+            return Err(Error::file(&path, what));
+        }
         model.sampler.load_state(&state).map_err(|error| Error::file(&path, error))?;
         // Training may have ended before all detail was enabled.
         let detail = stored_bytes(&bytes, DETAIL).map_err(|error| Error::file(&path, error))?;

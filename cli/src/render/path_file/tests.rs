@@ -208,6 +208,12 @@ fn read_ngp_poses_leave_the_unit_cube() {
         let Motion::Keys { path, .. } = of(&document, None, DAffine3::IDENTITY).unwrap().motion else { panic!() };
         path.shares()
     };
+    for (given, expected) in [(json!(2.5), Some(2.5)), (json!(0), None), (json!(-1), None), (json!(1e9), None)] {
+        let mut document = ngp_path();
+        document["duration_seconds"] = given.clone();
+        let Motion::Keys { seconds, .. } = of(&document, None, DAffine3::IDENTITY).unwrap().motion else { panic!() };
+        assert_eq!(seconds, expected, "{given}");
+    }
     // Timestamps are arrival times of the next key frame.
     assert_eq!(times(false, [1.0, 4.0, 9.0]), [0.0, 0.25, 1.0]);
     assert_eq!(times(true, [1.0, 4.0, 8.0]), [0.0, 0.125, 0.5]);

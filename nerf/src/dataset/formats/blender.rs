@@ -123,7 +123,7 @@ fn unfit(view: &View, first: &View) -> Option<String> {
     let near = |a: f64, b: f64| (a - b).abs() <= SAME * b.abs();
     let camera = &view.camera;
     let ([fx, fy], [cx, cy], [w, h]) = (camera.focal, camera.centre, [camera.width as f64, camera.height as f64]);
-    let undistort = "undistort the images first (`raygrad prepare --undistort`)";
+    let undistort = "convert the original with `raygrad prepare --undistort --to blender`";
     if camera.lens != Lens::Pinhole {
         return Some(format!("has lens distortion: {undistort}"));
     }

@@ -105,7 +105,8 @@ pub(super) fn read_model(folder: &Path, images: &Path, needed: bool) -> Result<C
     Ok(capture)
 }
 
-/// Writes the cameras and points of `capture` to `sparse/0` in `folder`.
+/// Writes the cameras and points of `capture` to `sparse/0` in `folder`, and nerfstudio's lists of splits beside it, if
+/// there are splits.
 ///
 /// The caller puts each image in `images` under the name of its view. Views with equal cameras share an entry. Tracks
 /// of points are not written.
@@ -115,7 +116,7 @@ pub(super) fn read_model(folder: &Path, images: &Path, needed: bool) -> Result<C
 /// would be read instead, or a file cannot be written. The error names the view or the file.
 pub fn write(capture: &Capture, folder: &Path, encoding: Encoding) -> Result<()> {
     let table = Table::new(capture, encoding)?;
-    let folder = folder.join("sparse").join("0");
+    let (root, folder) = (folder, folder.join("sparse").join("0"));
     let mut others = ["rigs.bin", "frames.bin", "rigs.txt", "frames.txt"].map(|name| folder.join(name)).to_vec();
     Encoding::ALL.iter().filter(|other| **other != encoding).for_each(|other| others.extend(other.files(&folder)));
     if let Some(other) = others.iter().find(|file| file.exists()) {
@@ -126,7 +127,8 @@ pub fn write(capture: &Capture, folder: &Path, encoding: Encoding) -> Result<()>
         Encoding::Binary => binary::encode(&table),
         Encoding::Text => text::encode(&table),
     };
-    encoding.files(&folder).iter().zip(bytes).try_for_each(|(file, bytes)| write_atomic(file, &bytes))
+    encoding.files(&folder).iter().zip(bytes).try_for_each(|(file, bytes)| write_atomic(file, &bytes))?;
+    splits::write(capture, root)
 }
 
 /// Parses the contents of the files, without reading any other file.

@@ -284,7 +284,8 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
 
 /// Checks that the format can hold a camera together with the first.
 fn plain(camera: &Camera, first: &Camera) -> std::result::Result<(), String> {
-    const UNDISTORT: &str = "LLFF needs equal pinhole cameras: undistort first (`raygrad prepare --undistort`)";
+    const UNDISTORT: &str =
+        "LLFF needs equal pinhole cameras: convert the original with `raygrad prepare --undistort --to llff`";
     let Camera { width, height, focal, centre, lens, .. } = camera;
     if *lens != Lens::Pinhole {
         return Err(format!("has lens distortion; {UNDISTORT}"));

@@ -253,7 +253,7 @@ fn unsupported_views_are_errors() {
         says(&message, parts);
         assert_eq!(file(folder.path()), None);
     };
-    let undistort = "`raygrad prepare --undistort`";
+    let undistort = "`raygrad prepare --undistort --to blender`";
     fails(|v| v.camera.lens = Lens::Fov { omega: 0.9 }, &["has lens distortion", undistort]);
     fails(|v| v.camera.focal[1] *= 1.01, &["so no square pixels", undistort]);
     fails(|v| v.camera.centre[0] += 0.5, &["at 4.5, 3, not at the centre", undistort]);

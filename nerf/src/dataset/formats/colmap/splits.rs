@@ -4,6 +4,7 @@ use super::super::locate::{fitting, shown};
 use crate::dataset::capture::Capture;
 use crate::dataset::frames::{CHOOSE, Split};
 use crate::error::{Error, Result};
+use crate::files::write_atomic;
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -26,6 +27,24 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
         if file.is_file() {
             read(capture, &file, split)?;
         }
+    }
+    Ok(())
+}
+
+/// Writes a list for each split, if there are splits. nerfstudio then requires all three: without validation images that
+/// list equals the test list.
+pub(super) fn write(capture: &Capture, folder: &Path) -> Result<()> {
+    let of = |split: Split| -> String {
+        let views = capture.views.iter().filter(|view| view.split == Some(split));
+        views.map(|view| format!("{}\n", view.name)).collect()
+    };
+    if capture.views.iter().all(|view| view.split.is_none()) {
+        return Ok(());
+    }
+    for split in Split::ALL {
+        let val = Some(of(split)).filter(|names| split != Split::Val || !names.is_empty());
+        let names = val.unwrap_or_else(|| of(Split::Test));
+        write_atomic(folder.join(format!("{split}_list.txt")), names.as_bytes())?;
     }
     Ok(())
 }

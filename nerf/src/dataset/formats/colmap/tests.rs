@@ -561,6 +561,21 @@ fn lists_of_splits_are_read() {
 }
 
 #[test]
+fn written_lists_of_splits_are_read_again() {
+    let mut capture = read(folder(Encoding::Text, "sparse/0", &eight(|_| None)).path()).unwrap();
+    let [train, val, test] = Split::ALL.map(Some);
+    for (splits, files) in [([None; 3], 0), ([train, val, test], 3), ([train, test, test], 3), ([train; 3], 3)] {
+        capture.views.iter_mut().enumerate().for_each(|(i, view)| view.split = splits[i % 3]);
+        let place = tempfile::tempdir().unwrap();
+        write(&capture, place.path(), Encoding::Binary).unwrap();
+        assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1 + files, "{splits:?}");
+        let again = read(place.path()).unwrap();
+        let of = |capture: &Capture| capture.views.iter().map(|view| view.split).collect::<Vec<_>>();
+        assert_eq!((of(&again), again.assumptions), (of(&capture), vec![]), "{splits:?}");
+    }
+}
+
+#[test]
 fn stale_copies_of_images_are_not_used() {
     let folder = folder(Encoding::Text, "sparse/0", &eight(|_| None));
     let write = |place: &str, i: usize, content: &str| {

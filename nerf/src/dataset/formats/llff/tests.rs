@@ -258,7 +258,7 @@ fn unwritable_llff_captures_are_named() {
     };
     camera(
         &|c| c.lens = Lens::Fov { omega: 1.0 },
-        "has lens distortion; LLFF needs equal pinhole cameras: undistort first",
+        "has lens distortion; LLFF needs equal pinhole cameras: convert the original with",
     );
     camera(&|c| c.centre[1] = 14.0, "has its principal point at (20, 14), not at the centre");
     camera(&|c| c.focal[1] = 14.0, "has different focal lengths, 55.5 and 14");

@@ -787,3 +787,26 @@ fn dynamic_masks_beside_images_are_used_where_no_other_is_given() {
                     black pixels";
     assert_eq!(masked(false), [expected]);
 }
+
+#[test]
+fn lens_models_of_different_cameras_are_written_at_the_top() {
+    let mut capture = read(folder(|_| {}).path()).unwrap();
+    let fisheye = Lens::Fisheye { k: [0.1, 0.0, 0.0, 0.0], p: [0.0; 2], s: [0.0; 2] };
+    capture.views[1].camera.focal[0] *= 1.5;
+    for (lenses, expected) in [
+        ([fisheye, fisheye], [json!("OPENCV_FISHEYE"), json!(true)]),
+        ([Lens::Pinhole, Lens::Pinhole], [json!("PINHOLE"), Value::Null]),
+        ([Lens::Pinhole, fisheye], [Value::Null, Value::Null]),
+    ] {
+        capture.views.truncate(2);
+        capture.views.iter_mut().zip(lenses).for_each(|(view, lens)| view.camera.lens = lens);
+        let place = tempfile::tempdir().unwrap();
+        write(&capture, place.path()).unwrap();
+        let written: Value = serde_json::from_slice(&std::fs::read(file(place.path())).unwrap()).unwrap();
+        assert_eq!(["camera_model", "is_fisheye"].map(|name| written[name].clone()), expected);
+        assert!(written.get("fl_x").is_none() && written["frames"][1]["fl_x"].is_number());
+        let again = read(place.path()).unwrap();
+        let cameras = |capture: &Capture| capture.views.iter().map(|view| view.camera.clone()).collect::<Vec<_>>();
+        assert_eq!(cameras(&again), cameras(&capture));
+    }
+}

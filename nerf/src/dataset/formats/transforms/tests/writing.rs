@@ -111,9 +111,9 @@ fn different_cameras_are_written_per_frame() {
     capture.views[2].depth.as_mut().unwrap().1 = 0.5;
     let (again, document) = written(&capture);
     assert_eq!(again, capture);
-    assert_eq!((document.get("fl_x"), document.get("camera_model")), (None, None));
-    // nerfstudio assumes OPENCV without a model.
-    assert_eq!((&document["frames"][2]["camera_model"], &document["frames"][2]["k1"]), (&"OPENCV".into(), &0.0.into()));
+    // nerfstudio reads a single model: that of the lens, which a pinhole is without coefficients.
+    assert_eq!((document.get("fl_x"), document.get("camera_model")), (None, Some(&"OPENCV".into())));
+    assert_eq!((document["frames"][2].get("camera_model"), &document["frames"][2]["k1"]), (None, &0.0.into()));
 }
 
 #[test]
