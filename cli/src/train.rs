@@ -362,7 +362,7 @@ fn follow() -> Work<Trained> {
     let mut exchange = ranks::take().ok_or_else(lost)?;
     let Shared { folder, config, budget, timeout } = ranks::of_first(&mut *exchange, None)?;
     let state = ranks::bytes_of_first(&mut *exchange, &[])?;
-    let (_, _, mut trainer) = reopen(&Run { folder: folder.clone(), config })?;
+    let (_, _, mut trainer) = reopen(&Run { folder: folder.clone(), config }, None)?;
     trainer.load_state(&state)?;
     trainer.share(exchange)?;
     set_timeout(&mut trainer, timeout);
@@ -382,9 +382,9 @@ fn follow() -> Work<Trained> {
 }
 
 /// Loads the images of a run and makes a trainer of its configuration, at step 0.
-fn reopen(run: &Run) -> Result<(Opened, Arc<Dataset>, Trainer)> {
+fn reopen(run: &Run, moved: Option<&Scene>) -> Result<(Opened, Arc<Dataset>, Trainer)> {
     let RunConfig { scene_box: extent, downscale, config, .. } = run.config.clone();
-    let mut scene = run.open_scene(None)?;
+    let mut scene = run.open_scene(moved)?;
     scene.depth = config.loss_terms.iter().any(|term| term.kind() == "depth");
     let data = scene.load(Split::Train, downscale, usize::MAX)?;
     let [near, far] = extent.near_far;
@@ -414,7 +414,10 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
         (None, None) => return Err(Error::setting("budget", "the run has none: add --budget or --steps")),
     };
     let mut lock = run.lock()?;
-    let (scene, data, mut trainer) = reopen(&run)?;
+    let (scene, data, mut trainer) = reopen(&run, args.moved.as_ref())?;
+    if args.moved.is_some() {
+        run.config.description = scene.description();
+    }
     let (downscale, background) = (run.config.downscale, run.config.config.background.shown());
     // Before the first file.
     interrupt::listen();

@@ -83,7 +83,7 @@ impl Args {
         ];
         for (name, _) in &self.set {
             let is_replaced = |key: &str| {
-                key.strip_prefix(name.as_str()).is_some_and(|rest| !rest.starts_with(char::is_alphanumeric))
+                key.strip_prefix(name.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
             };
             if let Some((flag, ..)) = flags.iter().find(|(_, is_given, key)| *is_given && is_replaced(key)) {
                 return Err(Error::setting(name, format!("replaces what --{flag} gives: leave out one of them")));
@@ -274,9 +274,12 @@ mod tests {
             let message = read(flags).unwrap_err().to_string();
             assert!(message.ends_with(&format!("replaces what --{flag} gives: leave out one of them")), "{message}");
         }
-        for flags in
-            ["--set seed=5", "--carve 2 --set sampler.samples=5000", "--loss entropy=0.1 --set loss_terms.1.weight=2"]
-        {
+        for flags in [
+            "--loss entropy=0.1 --set loss={\"huber\":{\"delta\":0.1}}",
+            "--set seed=5",
+            "--carve 2 --set sampler.samples=5000",
+            "--loss entropy=0.1 --set loss_terms.1.weight=2",
+        ] {
             read(flags).unwrap();
         }
     }

@@ -244,8 +244,14 @@ fn runs_do_not_switch_to_another_description() {
     for command in ["eval run", "export run cameras.json", "train --resume run --steps 2"] {
         place.fails(command, &expected);
     }
-    std::fs::rename(place.path("aside"), place.path("both/sparse")).unwrap();
-    place.succeeds("train --resume run --steps 2");
+    // A capture in another place may have another description, which the run then keeps to.
+    std::fs::remove_file(place.path("both/transforms.json")).unwrap();
+    std::fs::create_dir_all(place.path("both/colmap")).unwrap();
+    std::fs::rename(place.path("aside"), place.path("both/colmap/sparse")).unwrap();
+    std::fs::rename(place.path("both"), place.path("moved")).unwrap();
+    place.succeeds("train --resume run --scene moved --steps 2");
+    assert_eq!(place.json("run/config.json")["description"], "colmap/sparse/0/images.bin");
+    place.succeeds("eval run");
 }
 
 #[test]

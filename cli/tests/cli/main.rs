@@ -216,7 +216,7 @@ impl Place {
         String::from_utf8(output.stdout).unwrap()
     }
 
-    /// Checks that a command fails with one line besides notes, which starts with the program's name and contains all of `expected`.
+    /// Checks that a command fails with one line besides notes and warnings, which starts with the program's name and contains all of `expected`.
     #[track_caller]
     fn fails(&self, arguments: &str, expected: &[&str]) {
         complained(arguments, &self.command(arguments).output().unwrap(), expected);
@@ -240,7 +240,8 @@ fn complained_of(what: &str, output: &Output, message: &str) {
 fn complained(what: &str, output: &Output, expected: &[&str]) {
     let message = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{what}: {message}");
-    let mut lines = message.lines().filter(|line| !line.starts_with("raygrad: note: "));
+    let is_remark = |line: &str| ["note", "warning"].iter().any(|kind| line.starts_with(&format!("raygrad: {kind}: ")));
+    let mut lines = message.lines().filter(|line| !is_remark(line));
     let one_line = lines.next().is_some_and(|line| line.starts_with("raygrad: ")) && lines.next().is_none();
     assert!(one_line && expected.iter().all(|part| message.contains(part)), "{what}: {message}");
 }

@@ -153,15 +153,14 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
         intrinsics::write(&view.camera, model, &mut out);
         out
     });
-    let mut intrinsics: Vec<_> = intrinsics.collect();
+    let intrinsics: Vec<_> = intrinsics.collect();
     let shared = intrinsics.iter().all(|other| *other == intrinsics[0]);
     let mut top = if shared { intrinsics[0].clone() } else { Map::new() };
-    // nerfstudio and instant-ngp read the lens model at the top alone.
+    // nerfstudio reads the lens model at the top alone, and instant-ngp reads it beside the coefficients.
     for name in ["camera_model", "is_fisheye"] {
         let value = intrinsics[0].get(name).cloned();
         if let Some(value) = value.filter(|value| intrinsics.iter().all(|other| other.get(name) == Some(value))) {
             top.insert(name.to_owned(), value);
-            intrinsics.iter_mut().for_each(|own| drop(own.remove(name)));
         }
     }
     let unit = shared_unit(&capture.views);

@@ -31,14 +31,14 @@ pub(super) fn attach(capture: &mut Capture, model: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Writes a list for each split, if there are splits. nerfstudio then requires all three: without validation images that
-/// list equals the test list.
+/// Writes a list for each split, if images are held out. nerfstudio then requires all three: without validation images
+/// that list equals the test list.
 pub(super) fn write(capture: &Capture, folder: &Path) -> Result<()> {
     let of = |split: Split| -> String {
         let views = capture.views.iter().filter(|view| view.split == Some(split));
         views.map(|view| format!("{}\n", view.name)).collect()
     };
-    if capture.views.iter().all(|view| view.split.is_none()) {
+    if capture.views.iter().all(|view| matches!(view.split, None | Some(Split::Train))) {
         return Ok(());
     }
     for split in Split::ALL {
@@ -56,7 +56,7 @@ fn read(capture: &mut Capture, file: &Path, split: Split) -> Result<()> {
     let mut absent = vec![];
     for (i, line) in text.trim_start_matches('\u{feff}').lines().enumerate() {
         let name = line.trim().replace('\\', "/");
-        if name.is_empty() || name.starts_with('#') {
+        if name.is_empty() || name.starts_with('#') && !exact.contains_key(name.as_str()) {
             continue;
         }
         let wrong = |what: String| Err(Error::field(file, format!("line {}", i + 1), format!("{what}; {CHOOSE}")));

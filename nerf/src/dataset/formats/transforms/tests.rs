@@ -804,6 +804,8 @@ fn lens_models_of_different_cameras_are_written_at_the_top() {
         write(&capture, place.path()).unwrap();
         let written: Value = serde_json::from_slice(&std::fs::read(file(place.path())).unwrap()).unwrap();
         assert_eq!(["camera_model", "is_fisheye"].map(|name| written[name].clone()), expected);
+        let own = &written["frames"][1]["is_fisheye"];
+        assert_eq!(*own == json!(true), matches!(capture.views[1].camera.lens, Lens::Fisheye { .. }));
         assert!(written.get("fl_x").is_none() && written["frames"][1]["fl_x"].is_number());
         let again = read(place.path()).unwrap();
         let cameras = |capture: &Capture| capture.views.iter().map(|view| view.camera.clone()).collect::<Vec<_>>();
