@@ -154,5 +154,5 @@ fn errors_of_a_rank_end_all() {
     assert_eq!(said(&output).matches("--host and --port need --view").count(), 1, "{}", said(&output));
     let place = Place::with_run();
     let output = on_ranks(&place, 2, "eval run --json").output().unwrap();
-    assert!(!output.status.success() && said(&output).contains("--json"), "{output:?}");
+    assert!(!output.status.success() && said(&output).contains("`json`: needs a single process"), "{output:?}");
 }
