@@ -28,11 +28,11 @@ impl Capture {
     /// model. If a folder holds several descriptions, the one with most existing images counts; of equally many, the
     /// first of `transforms.json`, Blender, COLMAP and LLFF. [`assumptions`](Self::assumptions) states the choice.
     ///
-    /// Without splits in the files, folders such as `train` and `test` are splits if all images are in some. Without
-    /// these, every eighth image by name, from the first, is a [test](Split::Test) image, even if its file does not
-    /// exist. The others are training images. If the files list only training images, the others are test images; if
-    /// they list only held-out images, the others are training images. If they list both, others are
-    /// [not used](Self::assumptions).
+    /// Without splits in the files, those of Blender's files beside them count. Without these, folders such as `train` and
+    /// `test` are splits if all existing images are in some. Otherwise every eighth image by name, from the first, is a
+    /// [test](Split::Test) image, even if its file does not exist. The others are training images. If the files list
+    /// only training images, the others are test images; if they list only held-out images, the others are training
+    /// images. If they list both, others are [not used](Self::assumptions).
     ///
     /// # Errors
     /// If the path is absent or has no known format, a file has a bad field, or an image is in both the training and
