@@ -270,6 +270,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If one of `wrt` belongs to another tape.
     #[track_caller]
     pub fn try_jacobian(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Tensor<T>>, Error> {
+        self.check_graph(wrt)?;
         let inputs: usize = wrt.iter().map(|x| x.value.len()).sum();
         let outputs = self.value.len();
         let shape = |x: &Var<'t, T>| -> Shape { self.shape().iter().chain(x.shape()).copied().collect() };

@@ -110,8 +110,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// the graph, as those of [`grad_graph`](Self::grad_graph). This tensor may have any shape.
     ///
     /// # Panics
-    /// If `seed` has another shape than this tensor, and where [`grad`](Self::grad) panics, except for the number of
-    /// elements.
+    /// If `seed` has another shape than this tensor or belongs to another tape, and where [`grad`](Self::grad) panics,
+    /// except for the number of elements.
     #[track_caller]
     pub fn vjp(&self, seed: &Var<'t, T>, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
         self.tape.or_raise(self.try_vjp(seed, wrt))
@@ -124,7 +124,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// number of elements.
     ///
     /// # Panics
-    /// As [`try_grad`](Self::try_grad).
+    /// If `seed` belongs to another tape, and as [`try_grad`](Self::try_grad).
     #[track_caller]
     pub fn try_vjp(&self, seed: &Var<'t, T>, wrt: &[&Var<'t, T>]) -> Result<Vec<Var<'t, T>>, Error> {
         if seed.shape() != self.shape() {
@@ -161,6 +161,14 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The backward pass from this variable, if it and all of `wrt` can have a gradient.
     #[track_caller]
     fn sums(&self, seed: Var<'t, T>, wrt: &[&Var<'t, T>], keep: Keep) -> Result<Vec<Option<Sum<'t, T>>>, Error> {
+        assert!(std::ptr::eq(seed.tape, self.tape), "a gradient with a seed of another tape");
+        self.check_graph(wrt)?;
+        sweep(self, seed, wrt, keep, false, Location::caller())
+    }
+
+    /// Checks that this variable and all of `wrt` are on the graph of one tape.
+    #[track_caller]
+    pub(crate) fn check_graph(&self, wrt: &[&Var<'t, T>]) -> Result<(), Error> {
         let at = Location::caller();
         for x in wrt {
             assert!(std::ptr::eq(x.tape, self.tape), "a gradient with respect to a variable of another tape");
@@ -168,10 +176,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         if self.node.is_none() {
             return Err(Error::OfConstant { at });
         }
-        match wrt.iter().position(|x| x.node.is_none()) {
-            Some(index) => Err(Error::ByConstant { index, at }),
-            None => sweep(self, seed, wrt, keep, false, at),
-        }
+        wrt.iter().position(|x| x.node.is_none()).map_or(Ok(()), |index| Err(Error::ByConstant { index, at }))
     }
 }
 

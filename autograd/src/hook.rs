@@ -40,8 +40,11 @@ impl<'t, T: Scalar> Var<'t, T> {
     ///
     /// `f` works on variables, so a recorded pass records it and differentiates it too. Such a pass fails with
     /// [`Error::Unrecorded`](crate::Error::Unrecorded) if the result does not depend on the gradient. `f` is not called
-    /// if no gradient arrives. The hook sees the gradients of the returned variable alone; use that variable in place
-    /// of `self`.
+    /// if no gradient arrives. The hook sees the gradients of the returned variable alone; use that variable in place of
+    /// `self`.
+    ///
+    /// [`jvp`](Self::jvp) and [`jacobian`](Self::jacobian) take gradients as linear in the one that arrives. So they are
+    /// right for hooks that are linear, such as a scale, and not for those that clip.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

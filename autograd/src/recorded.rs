@@ -118,7 +118,12 @@ pub fn record<'t, T: Scalar, const N: usize, const M: usize>(
 ) -> [Var<'t, T>; M] {
     let sheet = Sheet::new();
     let results = formula(x.map(|x| sheet.given(x.clone())));
-    let vars = sheet.vars(x[0], &results);
+    assert!(N > 0 || M == 0, "{M} results of no variable: a function of constants needs no tape");
+    // Not in a closure, which would hide the caller's line.
+    let vars = match x.first() {
+        Some(x) => sheet.vars(x, &results),
+        None => vec![],
+    };
     from_fn(|i| vars[i].clone())
 }
 
@@ -207,5 +212,6 @@ mod tests {
         assert_eq!((tape.len() - before, y.item()), (1, 0.25));
         let [same] = record([&x], |x| x);
         assert_eq!(same.grad(&[&x])[0].item(), 1.0);
+        let [] = record::<f64, 0, 0>([], |[]| []);
     }
 }

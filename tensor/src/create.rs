@@ -35,8 +35,8 @@ pub fn concat<T: Scalar>(parts: &[&Tensor<T>], axis: usize, pool: &Pool<T>) -> T
 }
 
 impl<T: Scalar> Tensor<T> {
-    /// `start`, `start + step`, and so on, below `end` (`numpy.arange`). The shape is `[n]`, with n the ceiling of
-    /// `(end - start) / step`.
+    /// The numbers `start + i step` for i = 0, 1, ... that are below `end`, or above it if `step` is negative
+    /// (`numpy.arange`). They are computed in f64 and rounded to this type, so `end` itself is never an element.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -49,9 +49,17 @@ impl<T: Scalar> Tensor<T> {
     #[track_caller]
     pub fn arange(start: T, end: T, step: T) -> Self {
         let (first, by) = (start.to_f64(), step.to_f64());
-        let count = ((end.to_f64() - first) / by).ceil();
-        assert!(count.is_finite() && by.is_finite(), "arange from {start} to {end} by {step}");
-        Tensor::from_fn(&[count.max(0.0) as usize], |i| T::from_f64(first + i as f64 * by))
+        let most = ((end.to_f64() - first) / by).ceil();
+        assert!(most.is_finite() && by.is_finite(), "arange from {start} to {end} by {step}");
+        let at = |i: usize| T::from_f64(first + i as f64 * by);
+        // The last numbers may round to the end, and the quotient to less than their number.
+        let (mut count, mut rest) = (0, (most + 1.0).max(0.0) as usize);
+        while rest > 0 {
+            let half = rest / 2;
+            let is_element = if by > 0.0 { at(count + half) < end } else { at(count + half) > end };
+            (count, rest) = if is_element { (count + half + 1, rest - half - 1) } else { (count, half) };
+        }
+        Tensor::from_fn(&[count], at)
     }
 
     /// `count` equally spaced numbers from `start` to `end`, both included (`numpy.linspace`). For `count` 1 it is
@@ -222,6 +230,27 @@ mod tests {
         assert_eq!(Tensor::arange(0.0_f64, 0.95, 0.1).len(), 10);
         assert_eq!(Tensor::arange(1.0_f32, 1.0, 2.0).len(), 0);
         assert_eq!(Tensor::arange(5.0_f32, 1.0, 2.0).len(), 0);
+        assert_eq!(Tensor::arange(0.0_f32, 0.3, 0.1).to_vec(), [0.0, 0.1, 0.2]);
+        assert_eq!(Tensor::arange(1.0_f32, 0.1, -0.3).to_vec(), [1.0, 0.7, 0.4]);
+        // All numbers before the end are there, and none beyond it.
+        for (i, j) in (0..40_u8).flat_map(|i| (1..30).map(move |j| (i, i + j))) {
+            for sign in [1.0_f32, -1.0] {
+                let [start, end] = [i, j].map(|tenths| sign * f32::from(tenths) / 10.0);
+                let x = Tensor::arange(start, end, 0.1 * sign);
+                let next = (f64::from(start) + x.len() as f64 * f64::from(0.1 * sign)) as f32;
+                assert!(x.iter().all(|x| sign * x < sign * end) && sign * next >= sign * end, "{start} {end}: {x:?}");
+                let [start, end] = [i, j].map(|tenths| f64::from(sign) * f64::from(tenths) / 10.0);
+                let step = 0.15 * f64::from(sign);
+                let x = Tensor::arange(start, end, step);
+                let next = start + x.len() as f64 * step;
+                let sign = f64::from(sign);
+                assert!(x.iter().all(|x| sign * x < sign * end) && sign * next >= sign * end, "{start} {end}: {x:?}");
+            }
+        }
+        assert_eq!(Tensor::arange(-3.0, 0.6, 0.15).len(), 25, "the last is 0.5999999999999996");
+        // Steps below the rounding of the end.
+        let x = Tensor::arange(1.0_f32, 1.0 + f32::EPSILON, 1e-8);
+        assert!(x.len() == 6 && x.iter().all(|x| x == 1.0), "{x:?}");
         let grid = Tensor::linspace(-0.1_f32, 0.3, 11);
         assert_eq!((grid[[0]], grid[[10]]), (-0.1, 0.3));
         assert!(grid.as_slice().is_sorted());

@@ -319,8 +319,12 @@ fn variables_of_two_tapes_panic_together() {
     let (one, two) = (Tape::<f32>::new(), Tape::<f32>::new());
     let (x, y) = (one.leaf(Tensor::ones(&[])), two.leaf(Tensor::ones(&[])));
     assert!(panic_of(|| &x * &y).contains("another tape"));
-    let message = catch_unwind(AssertUnwindSafe(|| x.grad(&[&y]))).unwrap_err();
-    assert!(message.downcast_ref::<&str>().is_some_and(|text| text.contains("another tape")));
+    let by_other = catch_unwind(AssertUnwindSafe(|| drop(x.grad(&[&y]))));
+    let with_other = catch_unwind(AssertUnwindSafe(|| drop((&x + 1.0).vjp(&y, &[&x]))));
+    for (result, expected) in [(by_other, "a variable of another tape"), (with_other, "a seed of another tape")] {
+        let message = result.unwrap_err();
+        assert!(message.downcast_ref::<&str>().is_some_and(|text| text.contains(expected)));
+    }
 }
 
 #[test]
@@ -845,4 +849,13 @@ fn errors_of_chained_methods_can_be_handled() {
     assert_eq!(panic_of(|| tape.try_run(|| panic!("{}", "of another kind"))), "of another kind");
     assert!(panic_of(|| x.matmul(&w)).starts_with("matmul"));
     assert_eq!(tape.try_run(|| x.square().sum().grad(&[&x])).unwrap()[0], Tensor::full(&[2, 3], 2.0));
+}
+
+#[test]
+fn jacobians_of_nothing_check_their_variables() {
+    let tape = Tape::<f64>::new();
+    let (x, constant) = (tape.leaf(Tensor::zeros(&[0])), tape.constant(Tensor::zeros(&[0])));
+    assert_eq!(x.jacobian(&[&x])[0].shape(), [0, 0]);
+    assert!(matches!(constant.try_jacobian(&[&x]), Err(Error::OfConstant { .. })));
+    assert!(matches!(x.try_jacobian(&[&x, &constant]), Err(Error::ByConstant { index: 1, .. })));
 }

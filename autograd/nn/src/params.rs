@@ -71,7 +71,11 @@ impl Names {
         if self.keys.get(place) != Some(&key) {
             match self.names.get(place) {
                 Some(name) => panic!("a handle of another store: its parameter {place} is not this store's `{name}`"),
-                None => panic!("a handle of another store: its parameter {place}, of {} here", self.names.len()),
+                None => panic!(
+                    "a handle of another store: its parameter {place}, of {} here. If it is younger than this binding, bind \
+                     the parameters again",
+                    self.names.len()
+                ),
             }
         }
         place
@@ -260,7 +264,10 @@ impl<T: Scalar> Params<T> {
     /// If the factor is negative, infinite or NaN.
     #[track_caller]
     pub fn set_lr_scale(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
-        assert!(factor >= 0.0 && factor.is_finite(), "a learning rate times {factor}");
+        assert!(
+            factor >= 0.0 && factor.is_finite(),
+            "a learning rate times {factor}: use a finite factor of at least 0"
+        );
         self.set(which, |setting| setting.rate = factor)
     }
 
@@ -271,7 +278,10 @@ impl<T: Scalar> Params<T> {
     /// If the factor is negative, infinite or NaN.
     #[track_caller]
     pub fn set_weight_decay_scale(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
-        assert!(factor >= 0.0 && factor.is_finite(), "a weight decay times {factor}");
+        assert!(
+            factor >= 0.0 && factor.is_finite(),
+            "a weight decay times {factor}: use a finite factor of at least 0"
+        );
         self.set(which, |setting| setting.decay = factor)
     }
 
@@ -446,10 +456,16 @@ impl<T: Scalar> Params<T> {
     /// Checks that another store has parameters of the same names and shapes.
     #[track_caller]
     pub(crate) fn check_fits<U: Scalar>(&self, other: &Params<U>) {
-        assert!(
-            self.names.names == other.names.names,
-            "two stores whose parameters have other names, or another order"
-        );
+        let [own, others] = [&self.names.names, &other.names.names];
+        if let Some(i) = (0..own.len().max(others.len())).find(|&i| own.get(i) != others.get(i)) {
+            let shown = |names: &[String]| names.get(i).map_or("none".to_owned(), |name| format!("`{name}`"));
+            panic!(
+                "two stores with other parameters: parameter {i} is {} in one and {} in the other. Make copies such as an \
+                 average after the last parameter",
+                shown(own),
+                shown(others)
+            );
+        }
         for ((name, value), theirs) in self.iter().zip(&other.values) {
             assert_eq!(value.shape(), theirs.shape(), "two parameters `{name}`");
         }

@@ -160,7 +160,8 @@ impl Layout {
     pub fn windows(&self, axis: isize, size: usize, step: usize) -> Result<Self, String> {
         let (shape, axis) = (&self.shape, find_axis(axis, &self.shape)?);
         if !(1..=shape[axis]).contains(&size) || step == 0 {
-            return Err(format!("windows of {size} every {step} along axis {axis} of {shape:?}"));
+            let what = "a window has at least one entry and fits the axis, and a step is at least 1";
+            return Err(format!("windows of {size} every {step} along axis {axis} of {shape:?}: {what}"));
         }
         let mut out = self.clone();
         out.shape[axis] = (shape[axis] - size) / step + 1;

@@ -50,7 +50,8 @@ impl<T: Scalar> Ema<T> {
     }
 
     /// Adds the parameters after a step to the average. Returns the number of skipped elements, whose parameter is
-    /// infinite or NaN. Averages below 1e-30 (1e-300 in f64) become 0.
+    /// infinite or NaN. An average that is infinite or NaN becomes the first parameter that is not. Averages below 1e-30
+    /// (1e-300 in f64) become 0.
     ///
     /// # Panics
     /// If names or shapes of the parameters have changed. The average then does not change.
@@ -114,7 +115,8 @@ fn mean<T: Scalar, const SLOW: bool>(a: T, x: T, share: T) -> T {
     flushed(near + (share * far - share * near))
 }
 
-/// Replaces `a` by its [mean] with `x`. Elements of `x` that are not finite are skipped and counted.
+/// Replaces `a` by its [mean] with `x`, or by `x` if `a` is not finite. Elements of `x` that are not finite are skipped
+/// and counted.
 fn blend<T: Scalar, const SLOW: bool>(a: &mut [T], x: &[T], share: T) -> usize {
     simd::dispatch(
         #[inline(always)]
@@ -122,12 +124,16 @@ fn blend<T: Scalar, const SLOW: bool>(a: &mut [T], x: &[T], share: T) -> usize {
             let mut skipped = 0;
             for (a, x) in a.chunks_mut(BLOCK).zip(x.chunks(BLOCK)) {
                 // Without a choice for each element, the loop is vectorised.
-                if x.iter().fold(true, |all, x| all & x.is_finite()) {
+                if a.iter().zip(x).fold(true, |all, (a, x)| all & a.is_finite() & x.is_finite()) {
                     a.iter_mut().zip(x).for_each(|(a, &x)| *a = mean::<T, SLOW>(*a, x, share));
                     continue;
                 }
                 for (a, &x) in a.iter_mut().zip(x) {
-                    if x.is_finite() { *a = mean::<T, SLOW>(*a, x, share) } else { skipped += 1 }
+                    match (a.is_finite(), x.is_finite()) {
+                        (true, true) => *a = mean::<T, SLOW>(*a, x, share),
+                        (false, true) => *a = flushed(x),
+                        (_, false) => skipped += 1,
+                    }
                 }
             }
             skipped
@@ -191,6 +197,11 @@ mod tests {
             assert!(ema.params().values()[0].as_slice().iter().all(|a| !a.is_subnormal()));
         }
         assert_eq!(ema.into_params().values()[0].as_slice(), [0.0, 0.0]);
+        // An average that was never finite begins with the first finite value.
+        let mut late = Ema::new(&store(&[f64::NAN, f64::INFINITY]), 0.5);
+        assert_eq!(late.update(&store(&[f64::NAN, 3.0])), 1);
+        assert_eq!(late.update(&store(&[2.0, 5.0])), 0);
+        assert_eq!(late.params().values()[0].as_slice(), [2.0, 4.0]);
         let mut double = Ema::new(&store(&[1e-40, 1.0]), 0.5);
         double.update(&store(&[3e-40, 1.0]));
         assert_eq!(double.params().values()[0].as_slice(), [2e-40, 1.0], "f64 holds more");

@@ -86,7 +86,8 @@ impl<'a, T: Scalar> ParamUpdate<'a, T> {
 /// All optimizers here share three rules:
 /// - An element whose gradient or new value is infinite or NaN keeps its value and its state, and is counted. Its row
 ///   or parameter counts the step all the same. This holds for lazy and other parameters.
-/// - State below 1e-30 (1e-300 in f64) becomes 0, so that no denormal numbers slow the update down.
+/// - State below 1e-30 (1e-300 in f64) becomes 0, so that no denormal numbers slow the update down. So does a parameter
+///   below it that weight decay shrinks.
 /// - The bits are the same for any number of threads.
 ///
 /// [`Bound::backward`](crate::Bound::backward) returns the gradients and releases the parameters, so that they are

@@ -17,6 +17,9 @@ use serde::{Deserialize, Serialize};
 ///
 /// Rows without gradient of a lazy parameter do not change, for any velocity and decay. Without momentum and decay,
 /// lazy parameters are updated as others. Velocities below 1e-30 (1e-300 in f64) become 0.
+///
+/// A parameter without gradients so far has no entry in the state, and starts with a velocity of 0, as in PyTorch. So
+/// momentum also accepts the empty state of descent without momentum.
 #[derive(Debug, Clone)]
 pub struct Sgd<T: Scalar> {
     config: SgdConfig,
