@@ -181,10 +181,8 @@ fn best_line(transfer: &Transfer<'_>, corner: [f64; 2], patch: &Patch, most: f64
                 && moved[0] < transfer.to.width as f64
                 && moved[1] < transfer.to.height as f64;
             counts[i] += usize::from(inside);
-            let other = if inside { transfer.to.patch(moved, frame) } else { None };
-            if let Some(other) = other {
-                best[i] = best[i].max(patch.iter().zip(&other).map(|(x, y)| x * y).sum());
-            }
+            let alike = if inside { transfer.to.correlation(patch, moved, frame) } else { None };
+            best[i] = best[i].max(alike.unwrap_or(-1.0));
         }
     }
     // A line outside of the image cannot win, so it must not count as a loss.

@@ -64,43 +64,67 @@ impl Picture {
     }
 
     /// The value at a place, between pixels; NaN outside.
-    #[inline(always)]
-    pub fn at(&self, x: f32, y: f32) -> f32 {
+    fn at(&self, x: f32, y: f32) -> f32 {
         let [x, y] = [x - 0.5, y - 0.5];
         if !(x >= 0.0 && y >= 0.0 && x < (self.width - 1) as f32 && y < (self.height - 1) as f32) {
             return f32::NAN;
         }
-        // The conversion to i32 is one instruction.
         let (column, row) = (x as i32 as usize, y as i32 as usize);
-        let (s, t) = (x - column as f32, y - row as f32);
-        let start = row * self.width + column;
-        let [a, b] = [self.values[start], self.values[start + 1]];
-        let [c, d] = [self.values[start + self.width], self.values[start + self.width + 1]];
-        let (above, below) = (a + s * (b - a), c + s * (d - c));
-        above + t * (below - above)
+        self.between([column, row], [x - column as f32, y - row as f32])
     }
 
     /// The patch around a place whose columns and rows step by these vectors; `None` where something is not known or
     /// there is no contrast.
-    pub fn patch(&self, place: [f64; 2], [across, down]: [[f64; 2]; 2]) -> Option<Patch> {
+    pub fn patch(&self, place: [f64; 2], steps: [[f64; 2]; 2]) -> Option<Patch> {
+        let (mut patch, mean, length) = self.values_around(place, steps)?;
+        patch.iter_mut().for_each(|value| *value = (*value - mean) / length);
+        Some(patch)
+    }
+
+    /// The normalised cross-correlation of a patch with the one here; `None` where [`patch`](Self::patch) is.
+    pub fn correlation(&self, with: &Patch, place: [f64; 2], steps: [[f64; 2]; 2]) -> Option<f32> {
+        let (values, _, length) = self.values_around(place, steps)?;
+        // The mean of `with` is 0, so that of the values does not count.
+        Some(with.iter().zip(&values).map(|(x, y)| x * y).sum::<f32>() / length)
+    }
+
+    /// The values of a patch, their mean, and the length of their differences from it.
+    fn values_around(&self, place: [f64; 2], [across, down]: [[f64; 2]; 2]) -> Option<([f32; PATCH], f32, f32)> {
         let [[x, y], across, down] = [place, across, down].map(|vector| vector.map(|x| x as f32));
+        let [x, y] = [x - 0.5, y - 0.5];
+        let reach = |axis: usize| HALF as f32 * (across[axis].abs() + down[axis].abs());
+        let fits = |x: f32, reach: f32, extent: usize| x - reach >= 0.0 && x + reach < extent as f32 - 1.0;
+        if !(fits(x, reach(0), self.width) && fits(y, reach(1), self.height)) {
+            return None;
+        }
+        // Rounding may lead one pixel too far.
+        let [last_column, last_row] = [self.width - 2, self.height - 2];
         let mut patch = [0.0; PATCH];
         let mut sum = 0.0;
         for (row, v) in patch.chunks_exact_mut(SIDE).zip(-HALF..) {
             let [x, y] = [x + v as f32 * down[0], y + v as f32 * down[1]];
             for (value, u) in row.iter_mut().zip(-HALF..) {
-                *value = self.at(x + u as f32 * across[0], y + u as f32 * across[1]);
+                let [x, y] = [x + u as f32 * across[0], y + u as f32 * across[1]];
+                // The conversion to i32 is one instruction.
+                let (column, row) = ((x as i32 as usize).min(last_column), (y as i32 as usize).min(last_row));
+                *value = self.between([column, row], [x - column as f32, y - row as f32]);
                 sum += *value;
             }
         }
         // One NaN makes the sum NaN.
         let mean = sum / PATCH as f32;
         let length = patch.iter().map(|value| (value - mean) * (value - mean)).sum::<f32>().sqrt();
-        if !(length > 0.005 * (PATCH as f32).sqrt()) {
-            return None;
-        }
-        patch.iter_mut().for_each(|value| *value = (*value - mean) / length);
-        Some(patch)
+        (length > 0.005 * (PATCH as f32).sqrt()).then_some((patch, mean, length))
+    }
+
+    /// The value at a share of the way from a pixel to the next ones.
+    #[inline(always)]
+    fn between(&self, [column, row]: [usize; 2], [s, t]: [f32; 2]) -> f32 {
+        let start = row * self.width + column;
+        let [a, b] = [self.values[start], self.values[start + 1]];
+        let [c, d] = [self.values[start + self.width], self.values[start + self.width + 1]];
+        let (above, below) = (a + s * (b - a), c + s * (d - c));
+        above + t * (below - above)
     }
 
     /// Corners (Shi and Tomasi 1994): in each cell the position with the largest change under a shift in its weakest

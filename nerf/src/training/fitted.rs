@@ -86,6 +86,7 @@ mod tests {
     use crate::camera::Rays;
     use crate::component::ComponentConfig;
     use crate::dataset::{Split, sample::ball};
+    use crate::field::InstantConfig;
     use crate::model::{Preset, RefinedParam};
     use crate::random::Jitter;
     use crate::sampling::hierarchical::HierarchicalConfig;
@@ -105,7 +106,11 @@ mod tests {
 
     fn fitting_keeps_the_model_with(sampler: impl ComponentConfig<Samplers>) {
         let (data, sampler) = (Arc::new(ball(Split::Train, 8)), SamplerConfig::new(sampler));
-        let config = Config { sampler, ..Config::preset(Preset::Instant).with_refined(&[RefinedParam::Exposure]) };
+        let mut config = Config { sampler, ..Config::preset(Preset::Instant).with_refined(&[RefinedParam::Exposure]) };
+        config.field.get_mut::<InstantConfig>().unwrap().grid.log2_table = 12;
+        if let Some(marching) = config.sampler.get_mut::<MarchingConfig>() {
+            marching.occupancy.resolution = 16;
+        }
         let mut model = Trainer::new(config, data.clone()).unwrap().model;
         let exposure = model.params.find("exposure").unwrap();
         let gains = model.params.get(exposure).len();
