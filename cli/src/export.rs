@@ -60,7 +60,7 @@ pub struct Args {
     overwrite: bool,
     /// Also copy files from outside the capture
     ///
-    /// By default a new dataset takes no file from outside the capture folder, not even through a link.
+    /// By default a new dataset takes no file from outside the capture folder, not even through a link. Only with --to.
     #[arg(long, help_heading = "Output", requires = "to")]
     allow_outside: bool,
     #[command(flatten)]

@@ -82,12 +82,13 @@ pub struct Args {
     /// Convert every Nth image, starting with the Ith
     ///
     /// For several programs, such as a job array, that convert one dataset to a new folder. Give each the same command
-    /// with another I of I/N. The last one to finish makes the folder. See `raygrad merge`.
+    /// with another I of I/N. The last one to finish makes the folder. See `raygrad merge`. Only with --to or
+    /// --undistort.
     #[arg(long, help_heading = "Output", value_name = "I/N")]
     shard: Option<Shard>,
     /// Image width of a built-in scene, in pixels
     ///
-    /// The default is 200 for embedded and 400 for landscape.
+    /// The default is 200 for embedded and 400 for landscape. Only with --to.
     #[arg(long, help_heading = "Scene", value_name = "PIXELS", value_parser = parse::count(8192), requires = "to")]
     size: Option<usize>,
 }

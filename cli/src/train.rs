@@ -93,7 +93,8 @@ pub struct Args {
     /// Empty-space skipping: off, near-lossless, fast
     ///
     /// near-lossless changes a rendered colour by at most 0.6 % of its range, fast by at most 6 %. The default is
-    /// fast for instant and voxel. small and classic sample hierarchically unless --skip is given.
+    /// fast for instant and voxel. small and classic sample hierarchically unless --skip is
+    /// near-lossless or fast.
     #[arg(long, help_heading = "Model", value_parser = parse::word::<Skip>)]
     skip: Option<Skip>,
     /// Transparent images that empty a cell [default: 3]
@@ -125,8 +126,8 @@ pub struct Args {
     /// Divide the image size by K [default: automatic]
     ///
     /// A training pixel is the mean of the image pixels that it covers. The default brings the longest side to 1600
-    /// pixels or less, and all training images to about 3 GB or less. With a short budget it leaves as few as 800
-    /// pixels, since the model resolves no more. 1 keeps the size. Range: 1 to 16384.
+    /// pixels or less (panoramas: 6400), and all training images to about 3 GB or less. With a short budget it leaves
+    /// as few as 800 pixels, since the model resolves no more. 1 keeps the size. Range: 1 to 16384.
     #[arg(long, help_heading = "Scene", value_name = "K", value_parser = parse::count(1 << 14))]
     downscale: Option<usize>,
     #[command(flatten)]

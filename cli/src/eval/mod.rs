@@ -43,8 +43,8 @@ pub const COMMAND: &str = "eval";
 /// Writes RUN/eval-SPLIT-SKIP.json with the figures and the conditions they depend on.
 /// RUN/eval-SPLIT-SKIP/index.html shows up to 13 views, the worst ones among them: image, render, error, depth.
 ///
-/// --views, --precision, --fit-poses and --fit-half become part of the name, as in RUN/eval-val-off-10.json. A
-/// result with another --scene replaces the one of the same name.
+/// --views, --precision, --lpips, --fit-poses and --fit-half become part of the name, as in RUN/eval-val-off-10.json.
+/// A result with another --scene replaces the one of the same name.
 ///
 /// Example: raygrad eval my-run --views 10
 #[derive(clap::Args)]
@@ -136,6 +136,18 @@ fn hold_out(run: &Run, opened: &Opened) -> &'static str {
     }
 }
 
+/// Notes that no image of the scene bears the name of a training image, so that none is recognized as one.
+fn note_other_names(run: &Run, opened: &Opened) {
+    let (Some((capture, _)), names) = (&opened.capture, &run.config.images) else { return };
+    if !names.is_empty() && !capture.views.iter().any(|view| names.contains(&view.name)) {
+        let file = capture.file.display();
+        complain(&format!(
+            "note: {file} names none of the training images, so raygrad cannot tell whether images to compare are among \
+             them"
+        ));
+    }
+}
+
 /// Evaluates the model, writes the files and prints the result.
 pub fn run(args: &Args) -> Work<()> {
     let run = Run::open(&args.run)?;
@@ -162,6 +174,7 @@ pub fn run(args: &Args) -> Work<()> {
         );
         return Err(Error::setting("scene", what).into());
     }
+    note_other_names(&run, &opened);
     let images = fingerprint(&data)?;
     let appearance = Appearance::of(&model, args.split, args.fit_half);
     if let Some(lpips) = &lpips {

@@ -55,8 +55,8 @@ impl Target {
         matches!(self, Target::Llff | Target::Blender)
     }
 
-    /// Whether the format has masks.
-    fn has_masks(self) -> bool {
+    /// Whether the format has masks and sparse points.
+    fn has_masks_and_points(self) -> bool {
         !matches!(self, Target::Llff | Target::Blender)
     }
 
@@ -334,7 +334,7 @@ fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
     print(&format!("scene    {}: {}\n", out.display(), parts.join(", ")))
 }
 
-/// Warnings about masks, depth files and splits that the new dataset does not have, or only for some programs.
+/// Warnings about masks, points, depth files and splits that the new dataset does not have, or only for some programs.
 fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
     let count = |has: fn(&View) -> bool| capture.views.iter().filter(|view| has(view)).count();
     let masks = count(|view| view.mask.is_some());
@@ -342,7 +342,7 @@ fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
     let depths = count(|view| view.depth.is_some());
     let held_out = count(|view| view.split.is_some_and(|split| split != Split::Train));
     let mut warnings = vec![];
-    if masks > 0 && !target.has_masks() {
+    if masks > 0 && !target.has_masks_and_points() {
         warnings.push(format!("{masks} masks are not converted: the format has none"));
     }
     if dynamic > 0 && target == Target::Nerfstudio {
@@ -356,6 +356,9 @@ fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
                     .push(format!("{count} of {all} images have {what}: nerfstudio reads those of all images or none"));
             }
         }
+    }
+    if !capture.points.is_empty() && !target.has_masks_and_points() {
+        warnings.push(format!("{} sparse points are not converted: the format has none", capture.points.len()));
     }
     if depths > 0 && !target.has_depths() {
         warnings.push(format!("{depths} depth files are not converted: the format has none"));
@@ -373,7 +376,7 @@ fn lost(capture: &Capture, target: Target, undistorted: bool) -> Vec<String> {
 
 /// What is to be done with each photograph.
 fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> Result<Vec<Job>> {
-    let has_masks = target.has_masks();
+    let has_masks = target.has_masks_and_points();
     let has_depths = target.has_depths() && !undistorted;
     let mut taken = HashMap::new();
     let mut jobs = vec![];
@@ -505,7 +508,8 @@ fn make_parent(path: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DAffine3;
+    use glam::{DAffine3, DVec3};
+    use raygrad::nerf::dataset::Point;
     use std::collections::HashSet;
 
     #[test]
@@ -570,7 +574,9 @@ mod tests {
             [Some(Split::Train), Some(Split::Val), Some(Split::Test), Some(Split::Test), None].map(view).into();
         views[0].mask = Some("mask.png".into());
         (views[1].depth, views[2].depth) = (Some(("1.npy".into(), 1.0)), Some(("2.npy".into(), 1.0)));
-        let capture = Capture::new(Path::new("scene"), "scene/transforms.json".into(), Format::Transforms, views);
+        let mut capture = Capture::new(Path::new("scene"), "scene/transforms.json".into(), Format::Transforms, views);
+        capture.points = vec![Point { position: DVec3::ZERO, color: [0; 3], error: 0.5, views: 2 }; 3];
+        let points = "3 sparse points are not converted: the format has none";
         let masks = "1 masks are not converted: the format has none";
         let depths = "2 depth files are not converted: the format has none";
         let split = "3 held-out images lose their split, which the format cannot store: readers may hold out others, such \
@@ -582,10 +588,10 @@ mod tests {
         let some = some.each_ref().map(String::as_str);
         for (target, expected) in [
             (Target::Nerfstudio, some.to_vec()),
-            (Target::Blender, vec![masks, depths]),
+            (Target::Blender, vec![masks, points, depths]),
             (Target::Colmap, vec![depths]),
             (Target::ColmapText, vec![depths]),
-            (Target::Llff, vec![masks, depths, split]),
+            (Target::Llff, vec![masks, points, depths, split]),
         ] {
             assert_eq!(lost(&capture, target, false), expected, "{target:?}");
             let undistorted = match target {
@@ -605,7 +611,8 @@ mod tests {
         dynamic.mask_is_dynamic = false;
         capture.views[0] = dynamic;
         assert_eq!(lost(&capture, Target::Nerfstudio, false), [some]);
-        let capture = Capture { views: vec![view(Some(Split::Train)), view(None)], ..capture };
+        let views = vec![view(Some(Split::Train)), view(None)];
+        let capture = Capture { views, points: vec![], ..capture };
         assert_eq!(lost(&capture, Target::Llff, false), Vec::<String>::new());
     }
 }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use raygrad::nerf::dataset::{Dataset, SceneType};
 use raygrad::nerf::losses::DepthConfig;
+use raygrad::nerf::model::RefinedParam;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::{Budget, ClassicConfig, Config, Error, InstantConfig, LossTermConfig, Preset, Result, Trainer};
@@ -74,18 +75,32 @@ impl Args {
 
     /// Fails if `--set` replaces what another flag gives.
     fn check_set(&self) -> Result<()> {
+        let refines = |param| self.refine.contains(&param);
         let flags = [
             ("seed", self.seed != 0, "seed"),
             ("background", self.background.is_some(), "background"),
+            ("scene-type", self.capture.scene_type.is_some(), "unbounded"),
+            ("skip", self.skip.is_some(), "sampler.occupancy.skip"),
             ("carve", self.carve.is_some(), "sampler.occupancy.skip.carving"),
             ("loss", !self.loss.is_empty(), "loss_terms"),
             ("depth-loss", self.depth_loss.is_some(), "loss_terms"),
+            ("refine", refines(RefinedParam::Poses), "poses"),
+            ("refine", refines(RefinedParam::Focal), "camera_optimizer.focal"),
+            ("refine", refines(RefinedParam::Lens), "camera_optimizer.lens"),
+            ("refine", refines(RefinedParam::Exposure), "exposure_model.exposure"),
+            ("refine", refines(RefinedParam::Vignetting), "exposure_model.vignetting"),
+            ("no-positional-encoding", self.no_positional_encoding, "field.position_levels"),
+            ("no-positional-encoding", self.no_positional_encoding, "field.direction_levels"),
+            ("no-positional-encoding", self.no_positional_encoding, "sampler.proposal.position_levels"),
+            ("no-positional-encoding", self.no_positional_encoding, "sampler.proposal.direction_levels"),
         ];
-        for (name, _) in &self.set {
-            let is_replaced = |key: &str| {
-                key.strip_prefix(name.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+        for (name, value) in &self.set {
+            let is_replaced = |flag: &str, key: &str| match key.strip_prefix(name.as_str()) {
+                // Another learning rate of what is refined.
+                Some("") => flag != "refine" || value.is_null(),
+                rest => rest.is_some_and(|rest| rest.starts_with('.')),
             };
-            if let Some((flag, ..)) = flags.iter().find(|(_, is_given, key)| *is_given && is_replaced(key)) {
+            if let Some((flag, ..)) = flags.iter().find(|(flag, is_given, key)| *is_given && is_replaced(flag, key)) {
                 return Err(Error::setting(name, format!("replaces what --{flag} gives: leave out one of them")));
             }
         }
@@ -270,6 +285,16 @@ mod tests {
             ("--depth-loss --set loss_terms=[]", "depth-loss"),
             ("--carve 2 --set sampler.occupancy.skip.carving=3", "carve"),
             ("--carve 2 --set sampler.occupancy={}", "carve"),
+            ("--skip off --set sampler.occupancy.skip={}", "skip"),
+            ("--scene-type bounded --set unbounded=true", "scene-type"),
+            ("--refine focal,poses --set poses=null", "refine"),
+            ("--refine focal --set camera_optimizer.focal=null", "refine"),
+            ("--refine lens --set camera_optimizer={}", "refine"),
+            ("--refine exposure --set exposure_model={}", "refine"),
+            ("--refine vignetting --set exposure_model.vignetting=null", "refine"),
+            ("--preset small --no-positional-encoding --set field.position_levels=5", "no-positional-encoding"),
+            ("--preset small --no-positional-encoding --set field.direction_levels=5", "no-positional-encoding"),
+            ("--preset small --no-positional-encoding --set sampler.proposal={}", "no-positional-encoding"),
         ] {
             let message = read(flags).unwrap_err().to_string();
             assert!(message.ends_with(&format!("replaces what --{flag} gives: leave out one of them")), "{message}");
@@ -278,6 +303,10 @@ mod tests {
             "--loss entropy=0.1 --set loss={\"huber\":{\"delta\":0.1}}",
             "--set seed=5",
             "--carve 2 --set sampler.samples=5000",
+            "--skip fast --set sampler.occupancy.skip.carving=2",
+            "--refine poses --set camera_optimizer.coarse=0.5",
+            "--refine focal --set camera_optimizer.lens=null",
+            "--refine poses --set poses={\"constant\":{\"lr\":0.1}}",
             "--loss entropy=0.1 --set loss_terms.1.weight=2",
         ] {
             read(flags).unwrap();

@@ -345,6 +345,17 @@ fn eval_of_training_images_as_test_is_an_error() {
     place.fails("eval run --split val --scene absent", &["absent"]);
     // A path through images needs the training images.
     place.fails("render run --path spline --keyframes 0", &["trained on 6", "name their folder with --scene"]);
+    // If no name is known, trained images cannot be told from others.
+    let noted = |place: &Place| {
+        let output = place.command("eval run --scene scene").output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        String::from_utf8_lossy(&output.stderr).contains("names none of the training images")
+    };
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));
+    assert!(!noted(&place));
+    std::fs::remove_file(place.path("scene/transforms_train.json")).unwrap();
+    assert!(noted(&place));
     // Runs of version 0.1 do not store the names of images.
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));

@@ -17,7 +17,8 @@ use std::sync::Arc;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DistortionConfig {
-    /// Weight of the term. Usual are 0.001 to 0.01, and 0.1 in an unbounded scene. Range: 0 to 1000000.
+    /// Weight of the term. Usual are 0.001 to 0.01, and 0.1 in an unbounded scene without proposals. Range: 0
+    /// to 1000000.
     pub weight: f64,
 }
 

@@ -59,7 +59,7 @@ pub struct ProposalConfig {
     /// Rays in a tile, which one core computes on one tape. Range: 1 to 65536.
     pub tile: usize,
     /// Early termination: samples are dropped where the transmittance is below this. A colour changes by at most as
-    /// much. Range: 0 to 1.
+    /// much. Views also leave out colours of samples that weigh as much together. Range: 0 to 1.
     #[serde(alias = "termination")]
     pub early_stop_eps: f64,
 }

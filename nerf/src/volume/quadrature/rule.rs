@@ -23,8 +23,8 @@ pub enum Quadrature {
     /// Two evaluations in each interval, at the nodes of Gauss's rule. Colour is linear in optical depth
     /// ([`gauss_share`](super::gauss_share)).
     Gauss2,
-    /// As [`PiecewiseLinear`](Self::PiecewiseLinear), but halves intervals until halving changes a pixel by less
-    /// than `tolerance`. Each round evaluates colours.
+    /// One evaluation at each end of an interval too, but halves intervals until halving changes a pixel by less than
+    /// `tolerance`. Each round evaluates colours.
     Adaptive {
         /// Change of a pixel below which an interval is not halved further. Range: 0.000000001 to 1.
         tolerance: f64,
