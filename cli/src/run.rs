@@ -113,18 +113,6 @@ impl Run {
         Ok((run, lock))
     }
 
-    /// Removes a run without a model or a checkpoint, of which nothing was trained, and its folder if nothing else is
-    /// in it. Others stay.
-    pub fn discard_untrained(&self, lock: Lock) {
-        let made = [self.model_file(), self.file("checkpoints")];
-        if made.iter().any(|made| made.exists()) {
-            return;
-        }
-        remove(&[self.file("config.json")]);
-        lock.remove();
-        let _ = std::fs::remove_dir(&self.folder);
-    }
-
     /// Writes `config.json`.
     pub fn write(&self) -> Result<()> {
         write_json(&self.file("config.json"), &self.config)

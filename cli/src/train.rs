@@ -289,8 +289,10 @@ fn begin(args: &Args, listener: Option<Listener>) -> Work<Trained> {
     let data = Arc::new(data);
     let config = args.config(&data)?;
     let background = config.background.shown();
-    let trainer = Trainer::new(config, data.clone())?;
+    let mut trainer = Trainer::new(config, data.clone())?;
     let run_config = args.run_config((&source, &scene), downscale, &trainer, &data)?;
+    // A rank that cannot begin ends the job, so that nothing may exist yet.
+    share(&mut trainer, (&folder, &run_config), args.budget(), args.patience())?;
     // Before the first file.
     interrupt::listen();
     let (run, lock) = loop {
@@ -340,12 +342,16 @@ struct Shared {
 }
 
 /// Shares the training of a run with the other ranks, if there are any.
-fn share(trainer: &mut Trainer, run: &Run, budget: Budget, timeout: Duration) -> Result<()> {
+fn share(
+    trainer: &mut Trainer,
+    (folder, config): (&Path, &RunConfig),
+    budget: Budget,
+    timeout: Duration,
+) -> Result<()> {
     let Some(mut exchange) = ranks::take() else { return Ok(()) };
-    let shared = Shared { folder: run.folder.clone(), config: run.config.clone(), budget, timeout };
+    let shared = Shared { folder: folder.to_owned(), config: config.clone(), budget, timeout };
     ranks::of_first(&mut *exchange, Some(&shared))?;
     ranks::bytes_of_first(&mut *exchange, &trainer.state()?)?;
-    print(&format!("ranks    {}, connected by MPI\n", exchange.ranks()))?;
     trainer.share(exchange)?;
     set_timeout(trainer, timeout);
     Ok(())
@@ -433,6 +439,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     if !is_over {
         run.config.budget = Some(budget);
     }
+    share(&mut trainer, (&run.folder, &run.config), budget, args.patience())?;
     if run.config != before {
         run.write()?;
     }
@@ -456,12 +463,8 @@ fn train(
     preview: Preview,
     listener: Option<Listener>,
 ) -> Result<Trained> {
-    // A page can pause the training for as long as it likes.
-    let timeout = if args.view { ranks::PATIENCE } else { args.rank_timeout };
-    if let Err(error) = share(&mut trainer, &run, budget, timeout) {
-        // The same command may be given again.
-        run.discard_untrained(lock);
-        return Err(error);
+    if let Some(exchange) = trainer.exchange_mut() {
+        print(&format!("ranks    {}, connected by MPI\n", exchange.ranks()))?;
     }
     let sent = |trainer: &mut Trainer| trainer.exchange_mut().map(|exchange| exchange.sent_bytes());
     let before = (trainer.stats().step, sent(&mut trainer));

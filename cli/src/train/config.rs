@@ -176,6 +176,11 @@ impl Args {
         })
     }
 
+    /// How long ranks wait for one another in training. A page can pause it for as long as it likes.
+    pub fn patience(&self) -> Duration {
+        if self.view { ranks::PATIENCE } else { self.rank_timeout }
+    }
+
     /// The budget, if a flag sets it.
     pub fn given(&self) -> Option<Budget> {
         self.steps.map(Budget::Steps).or(self.budget.map(Budget::Time))
