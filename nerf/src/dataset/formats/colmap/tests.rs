@@ -570,6 +570,12 @@ fn written_lists_of_splits_are_read_again() {
         let place = tempfile::tempdir().unwrap();
         write(&capture, place.path(), Encoding::Binary).unwrap();
         assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1 + files, "{splits:?}");
+        if splits == [train, test, test] {
+            // nerfstudio evaluates on the validation images.
+            let [val, test] =
+                ["val", "test"].map(|split| fs::read(place.path().join(format!("{split}_list.txt"))).unwrap());
+            assert!(val == test && !val.is_empty());
+        }
         let again = read(place.path()).unwrap();
         let of = |capture: &Capture| {
             let mut all: Vec<_> = capture.views.iter().map(|view| (view.name.clone(), view.split)).collect();
